@@ -1,0 +1,124 @@
+"""Checks at the public boundary: each error names the argument, what came and what was expected."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+#: Quaternions may have any length in this range; beyond it their squares leave the range of float32.
+SHORTEST_QUATERNION, LONGEST_QUATERNION = 1e-15, 1e15
+
+
+def is_floating_tensor(name: str, x: object) -> Tensor:
+    """`x` itself if it is a float32 or float64 tensor."""
+    if not isinstance(x, Tensor):
+        raise TypeError(
+            f"{name}: expected a torch.Tensor, got {type(x).__name__}; convert it with torch.as_tensor"
+        )
+    if x.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: expected dtype torch.float32 or torch.float64, got {x.dtype}")
+    return x
+
+
+def has_last(name: str, x: Tensor, size: int, meaning: str) -> Tensor:
+    """`x` itself if its last dimension is `size`."""
+    if x.ndim == 0 or x.shape[-1] != size:
+        raise ValueError(f"{name}: expected shape (..., {size}), {meaning}, got {tuple(x.shape)}")
+    return x
+
+
+def same_kind(**tensors: Tensor) -> None:
+    """All tensors agree in dtype and device."""
+    (first_name, first), *others = tensors.items()
+    for name, x in others:
+        if x.dtype != first.dtype:
+            raise TypeError(
+                f"{name}: dtype {x.dtype} differs from that of {first_name}, {first.dtype}; "
+                "convert one of them with .to(dtype)"
+            )
+        if x.device != first.device:
+            raise ValueError(
+                f"{name}: on device {x.device}, but {first_name} is on {first.device}; move one with .to(device)"
+            )
+
+
+def broadcast(**shapes: Sequence[int]) -> torch.Size:
+    """The common shape of the named shapes."""
+    try:
+        return torch.broadcast_shapes(*shapes.values())
+    except RuntimeError:
+        listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+        raise ValueError(f"batch shapes do not broadcast: {listed}") from None
+
+
+def values_visible(*tensors: Tensor) -> bool:
+    """Whether looking at values is possible and free of a device round trip: eager code on the CPU."""
+    if torch.compiler.is_compiling():
+        return False
+    return all(x.device.type == "cpu" for x in tensors)
+
+
+def finite(name: str, x: Tensor) -> None:
+    """Every number is finite. Silent where values cannot be seen (other devices, `vmap`, compilation)."""
+    if not values_visible(x) or x.numel() == 0:
+        return
+    x = x.detach()
+    # A sum is finite only if every term is, and needs no memory; if it is not, look again to be sure.
+    if _truth(torch.isfinite(x.sum())) or _truth(torch.isfinite(x).all()):
+        return
+    where = tuple(torch.nonzero(~torch.isfinite(x))[0].tolist())
+    raise ValueError(f"{name}: expected finite numbers, got {x[where].item()} at index {where}")
+
+
+def quaternions(name: str, x: Tensor, blocks: Sequence[tuple[int, int]]) -> None:
+    """Every quaternion in the component ranges `blocks` has a length that can be divided by."""
+    if not values_visible(x) or x.numel() == 0:
+        return
+    for start, stop in blocks:
+        length = x.detach()[..., start:stop].norm(dim=-1)
+        good = (length >= SHORTEST_QUATERNION * 0.999) & (length <= LONGEST_QUATERNION * 1.001)
+        if _truth(good.all()):
+            continue
+        where = tuple(torch.nonzero(~good)[0].tolist())
+        raise ValueError(
+            f"{name}: expected quaternions (components {start} to {stop - 1}) of a length between "
+            f"{SHORTEST_QUATERNION:g} and {LONGEST_QUATERNION:g}, got length {length[where].item():g} "
+            f"at index {where}"
+        )
+
+
+def close_matrices(name: str, x: Tensor, valid: Tensor, tolerance: float) -> None:
+    """Every matrix equals its nearest valid one up to `tolerance`, relative to entries above one."""
+    if not values_visible(x) or x.numel() == 0:
+        return
+    defect = ((x.detach() - valid).abs() / valid.abs().clamp_min(1.0)).amax(dim=(-1, -2))
+    if _truth((defect <= tolerance).all()):
+        return
+    where = tuple(torch.nonzero(~(defect <= tolerance))[0].tolist())
+    raise ValueError(
+        f"{name}: expected matrices of the group, but the one at index {where} is off by "
+        f"{defect[where].item():.1e}: rotation blocks must be orthonormal with determinant one"
+    )
+
+
+def positive(name: str, x: float) -> float:
+    """A finite number above zero."""
+    if not (math.isfinite(x) and x > 0):
+        raise ValueError(f"{name}: expected a finite number above zero, got {x}")
+    return x
+
+
+def choice(name: str, x: str, allowed: Sequence[str]) -> str:
+    """One of the `allowed` words."""
+    if x not in allowed:
+        raise ValueError(f"{name}: expected one of {', '.join(map(repr, allowed))}, got {x!r}")
+    return x
+
+
+def _truth(condition: Tensor) -> bool:
+    """Its value, or True where torch will not tell (inside `vmap`)."""
+    try:
+        return bool(condition)
+    except RuntimeError:
+        return True

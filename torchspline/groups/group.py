@@ -1,0 +1,255 @@
+"""Lie groups on tensors: batched, broadcasting, in the dtype and on the device of their arguments."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.registry import arithmetic
+from torchspline.groups.components import join, split
+from torchspline.groups.operations import run
+
+Side = Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class Group:
+    """A Lie group by name: "SO3", "SE3", "R<n>", or a direct product such as "R3xSO3".
+
+    Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`. Quaternions are [w, x, y, z] and may
+    have any length from 1e-15 to 1e15: no function depends on it, and gradients are orthogonal to them. Methods
+    raise `TypeError` for a wrong dtype or type and `ValueError` for a wrong shape, device or value (values are
+    looked at on the CPU only).
+    """
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise TypeError(f"group: expected a name such as 'SO3', got {type(self.name).__name__}")
+        arithmetic(self.name)
+
+    @property
+    def arithmetic(self) -> GroupArithmetic:
+        return arithmetic(self.name)
+
+    @property
+    def point_size(self) -> int:
+        """Numbers that store a point."""
+        return self.arithmetic.point_size
+
+    @property
+    def tangent_size(self) -> int:
+        """Dimension of the tangent space."""
+        return self.arithmetic.tangent_size
+
+    def __str__(self) -> str:
+        return self.name
+
+    # ------------------------------------------------------------------ making points
+
+    def identity(
+        self, *batch: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
+    ) -> Tensor:
+        """The neutral element, `(*batch, point_size)`."""
+        element = torch.tensor(self.arithmetic.identity(), dtype=dtype, device=device)
+        return element.expand(*batch, self.point_size).clone()
+
+    def random(
+        self,
+        *batch: int,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Random points `(*batch, point_size)`: rotations uniform, translations standard normal."""
+        numbers = torch.randn(*batch, self.point_size, generator=generator, dtype=dtype, device=device)
+        return join(self.arithmetic.normalize(split(numbers)), numbers)
+
+    def from_matrix(self, matrix: Tensor) -> Tensor:
+        """Points `(..., point_size)` of (homogeneous) matrices `(..., n, n)`; differentiable at half-turns too.
+
+        Raises:
+            ValueError: a rotation block is off by more than 1e-3.
+        """
+        size = self.arithmetic.matrix_size
+        checks.is_floating_tensor("matrix", matrix)
+        if matrix.ndim < 2 or matrix.shape[-2:] != (size, size):
+            raise ValueError(
+                f"matrix: expected shape (..., {size}, {size}) for {self}, got {tuple(matrix.shape)}"
+            )
+        checks.finite("matrix", matrix)
+        rows = tuple(split(row) for row in matrix.unbind(-2))
+        points = join(self.arithmetic.from_matrix(rows), matrix[..., 0])
+        back = self.to_matrix(points.detach(), validate=False)
+        checks.close_matrices("matrix", matrix, back, 1e-3)
+        return points
+
+    # ------------------------------------------------------------------ operations with curvature
+
+    def exp(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """Exp: tangents `(..., tangent_size)` to points, [S20] (1). Any angle; smooth everywhere."""
+        self._accept(validate, tangent=(tangent, "tangent"))
+        return run("exp", self.name, tangent)
+
+    def log(self, point: Tensor, *, validate: bool = True) -> Tensor:
+        """Log: the shortest tangent whose `exp` is the point, [S20] (2).
+
+        At a rotation by exactly pi both ways round are as short; the first non-zero component is then positive,
+        and the gradient is that of this side.
+        """
+        self._accept(validate, point=(point, "point"))
+        return run("log", self.name, point)
+
+    def compose(self, left: Tensor, right: Tensor, *, validate: bool = True) -> Tensor:
+        """The product `left right`: with poses, first `right` then `left` acts on a point."""
+        self._accept(validate, left=(left, "point"), right=(right, "point"))
+        return run("compose", self.name, left, right)
+
+    def inverse(self, point: Tensor, *, validate: bool = True) -> Tensor:
+        """The inverse element."""
+        self._accept(validate, point=(point, "point"))
+        return run("inverse", self.name, point)
+
+    def act(self, point: Tensor, vector: Tensor, *, validate: bool = True) -> Tensor:
+        """`point` applied to vectors `(..., act_size)`: SO3 rotates, SE3 rotates and shifts, R^n shifts.
+
+        A direct product acts on the vectors of its factors side by side: `R3xSO3` takes six numbers.
+        """
+        self._accept(validate, point=(point, "point"), vector=(vector, "vector"))
+        return run("act", self.name, point, vector)
+
+    def interpolate(self, start: Tensor, end: Tensor, s: Tensor | float, *, validate: bool = True) -> Tensor:
+        """The geodesic `start Exp(s Log(start^-1 end))`, [H18] (14); beyond 0 and 1 it goes on.
+
+        Args:
+            s: a number, or a tensor whose shape broadcasts with the batch shape of the points.
+        """
+        self._accept(validate, start=(start, "point"), end=(end, "point"))
+        if not isinstance(s, Tensor):
+            s = torch.as_tensor(s, dtype=start.dtype, device=start.device)
+        checks.is_floating_tensor("s", s)
+        checks.same_kind(start=start, s=s)
+        checks.broadcast(start=start.shape[:-1], end=end.shape[:-1], s=s.shape)
+        if validate:
+            checks.finite("s", s)
+        return run("interpolate", self.name, start, end, s.unsqueeze(-1))
+
+    # ------------------------------------------------------------------ compositions of these
+
+    def between(self, start: Tensor, end: Tensor, *, validate: bool = True) -> Tensor:
+        """`start^-1 end`, the end as seen from the start."""
+        self._accept(validate, start=(start, "point"), end=(end, "point"))
+        return run("compose", self.name, run("inverse", self.name, start), end)
+
+    def retract(
+        self, point: Tensor, tangent: Tensor, *, side: Side = "left", validate: bool = True
+    ) -> Tensor:
+        """A step from `point`: `Exp(tangent) point` (left, [S20] (11)) or `point Exp(tangent)` (right)."""
+        checks.choice("side", side, ("left", "right"))
+        self._accept(validate, point=(point, "point"), tangent=(tangent, "tangent"))
+        step = run("exp", self.name, tangent)
+        pair = (step, point) if side == "left" else (point, step)
+        return run("compose", self.name, *pair)
+
+    # ------------------------------------------------------------------ linear maps
+
+    def normalize(self, point: Tensor, *, validate: bool = True) -> Tensor:
+        """The unit representative: quaternions are scaled to length one, their sign stays."""
+        self._accept(validate, point=(point, "point"))
+        return join(self.arithmetic.normalize(split(point)), point)
+
+    def adjoint(self, point: Tensor, *, validate: bool = True) -> Tensor:
+        """The matrix of Ad_X, [S20] (3): `X Exp(v) = Exp(Ad_X v) X`. `(..., D, D)`."""
+        self._accept(validate, point=(point, "point"))
+        X = self.arithmetic.normalize(split(point.unsqueeze(-2)))
+        return self._matrix(lambda v: self.arithmetic.adjoint(X, v), point)
+
+    def adjoint_act(self, point: Tensor, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """Ad_X v without forming the matrix."""
+        self._accept(validate, point=(point, "point"), tangent=(tangent, "tangent"))
+        X = self.arithmetic.normalize(split(point))
+        return join(self.arithmetic.adjoint(X, split(tangent)), tangent)
+
+    def bracket(self, a: Tensor, b: Tensor, *, validate: bool = True) -> Tensor:
+        """The Lie bracket `[a, b] = ad_a b` of tangents; corrects [S20] (6), which should read V W - W V."""
+        self._accept(validate, a=(a, "tangent"), b=(b, "tangent"))
+        a, b = torch.broadcast_tensors(a, b)
+        return join(self.arithmetic.bracket(split(a), split(b)), a)
+
+    def left_jacobian(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """J_l `(..., D, D)`: `Exp(x + v) = Exp(J_l(x) v) Exp(x)` to first order."""
+        return self._jacobian("left_jacobian", tangent, validate)
+
+    def right_jacobian(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """J_r `(..., D, D)`, [S20] (8), (72): `Exp(x + v) = Exp(x) Exp(J_r(x) v)` to first order."""
+        return self._jacobian("right_jacobian", tangent, validate)
+
+    def left_jacobian_inverse(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """J_l^-1 `(..., D, D)`; infinite where the angle is a multiple of 2 pi other than 0."""
+        return self._jacobian("left_jacobian_inverse", tangent, validate)
+
+    def right_jacobian_inverse(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
+        """J_r^-1 `(..., D, D)`, [S20] (9), (73); infinite where the angle is a multiple of 2 pi other than 0."""
+        return self._jacobian("right_jacobian_inverse", tangent, validate)
+
+    def to_matrix(self, point: Tensor, *, validate: bool = True) -> Tensor:
+        """The matrix: 3x3 for SO3, homogeneous 4x4 for SE3, block diagonal for products."""
+        self._accept(validate, point=(point, "point"))
+        rows = self.arithmetic.to_matrix(self.arithmetic.normalize(split(point)))
+        return torch.stack([join(row, point) for row in rows], dim=-2)
+
+    # ------------------------------------------------------------------ helpers
+
+    def _jacobian(self, kind: str, tangent: Tensor, validate: bool) -> Tensor:
+        self._accept(validate, tangent=(tangent, "tangent"))
+        x = split(tangent.unsqueeze(-2))
+        return self._matrix(lambda v: getattr(self.arithmetic, kind)(x, v), tangent)
+
+    def _matrix(self, linear, like: Tensor) -> Tensor:
+        """The matrix of a linear map of tangents: its action on all unit vectors at once, as columns."""
+        size = self.tangent_size
+        unit_vectors = torch.eye(size, dtype=like.dtype, device=like.device)
+        unit_vectors = unit_vectors.expand(*like.shape[:-1], size, size)
+        return join(linear(split(unit_vectors)), unit_vectors).mT
+
+    def _accept(self, validate: bool, **arguments: tuple[Tensor, str]) -> None:
+        """Check type, dtype, shape, device and, unless told not to, values of the named arguments."""
+        sizes = {
+            "point": (self.point_size, f"a point of {self}"),
+            "tangent": (self.tangent_size, f"a tangent of {self}"),
+            "vector": (self.arithmetic.act_size, f"a vector that {self} acts on"),
+        }
+        for name, (x, kind) in arguments.items():
+            checks.is_floating_tensor(name, x)
+            checks.has_last(name, x, *sizes[kind])
+        checks.same_kind(**{name: x for name, (x, _) in arguments.items()})
+        checks.broadcast(**{name: x.shape[:-1] for name, (x, _) in arguments.items()})
+        if not validate:
+            return
+        for name, (x, kind) in arguments.items():
+            checks.finite(name, x)
+            if kind == "point":
+                checks.quaternions(name, x, self.arithmetic.sign_blocks)
+
+
+SO3 = Group("SO3")
+SE3 = Group("SE3")
+R3 = Group("R3")
+
+
+def Rn(size: int) -> Group:
+    """R^n under addition."""
+    if not isinstance(size, int) or size < 1:
+        raise ValueError(f"size: expected a positive whole number, got {size!r}")
+    return Group(f"R{size}")
+
+
+def product(*groups: Group) -> Group:
+    """The direct product; `product(R3, SO3)` is the split pose."""
+    if len(groups) < 2:
+        raise ValueError(f"groups: expected at least two, got {len(groups)}")
+    return Group("x".join(group.name for group in groups))

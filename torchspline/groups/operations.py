@@ -1,0 +1,244 @@
+"""Group operations with hand-derived derivatives: one autograd function runs all of them on every group.
+
+An operation says how it acts on components and how first changes pass through it, forwards (`tangent`) and
+backwards (`reverse`). Derivatives of higher order come from automatic differentiation of these, which is why
+they consist of plain differentiable arithmetic.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.recurrence import forward, reverse, tangent
+from torchspline.arithmetic.registry import arithmetic
+from torchspline.arithmetic.vector import Vector, add, negate, zero
+from torchspline.groups.components import join, split
+
+
+class Operation(ABC):
+    """One operation on components. Points are stored numbers, quaternions of any length."""
+
+    @abstractmethod
+    def forward(self, group: GroupArithmetic, *arguments: Vector) -> Vector:
+        """The result."""
+
+    @abstractmethod
+    def reverse(
+        self, group: GroupArithmetic, arguments: tuple[Vector, ...], cotangent: Vector
+    ) -> tuple[Vector, ...]:
+        """Euclidean gradients of all arguments."""
+
+    @abstractmethod
+    def tangent(
+        self, group: GroupArithmetic, arguments: tuple[Vector, ...], rates: tuple[Vector, ...]
+    ) -> Vector:
+        """Rate of the result, given those of the arguments."""
+
+
+class Exp(Operation):
+    def forward(self, group, x):
+        return group.exp(x)
+
+    def reverse(self, group, arguments, cotangent):
+        (x,) = arguments
+        return (group.right_jacobian_transpose(x, group.pull(group.exp(x), cotangent)),)
+
+    def tangent(self, group, arguments, rates):
+        (x,), (dx,) = arguments, rates
+        return group.push(group.exp(x), group.right_jacobian(x, dx))
+
+
+class Log(Operation):
+    def forward(self, group, stored):
+        return group.log(group.normalize(stored))
+
+    def reverse(self, group, arguments, cotangent):
+        x = self.forward(group, *arguments)
+        return (group.embed(*arguments, group.right_jacobian_inverse_transpose(x, cotangent, short=True)),)
+
+    def tangent(self, group, arguments, rates):
+        x = self.forward(group, *arguments)
+        return group.right_jacobian_inverse(x, group.extract(*arguments, *rates), short=True)
+
+
+class Compose(Operation):
+    def forward(self, group, left, right):
+        return group.compose(group.normalize(left), group.normalize(right))
+
+    def reverse(self, group, arguments, cotangent):
+        left, right = arguments
+        g = group.pull(self.forward(group, left, right), cotangent)
+        return group.embed(left, group.coadjoint_inverse(group.normalize(right), g)), group.embed(right, g)
+
+    def tangent(self, group, arguments, rates):
+        left, right = arguments
+        moved = group.adjoint_inverse(group.normalize(right), group.extract(left, rates[0]))
+        return group.push(self.forward(group, left, right), add(moved, group.extract(right, rates[1])))
+
+
+class Inverse(Operation):
+    def forward(self, group, stored):
+        return group.inverse(group.normalize(stored))
+
+    def reverse(self, group, arguments, cotangent):
+        inverse = self.forward(group, *arguments)
+        g = group.coadjoint_inverse(inverse, group.pull(inverse, cotangent))
+        return (group.embed(*arguments, negate(g)),)
+
+    def tangent(self, group, arguments, rates):
+        inverse = self.forward(group, *arguments)
+        xi = group.adjoint_inverse(inverse, group.extract(*arguments, *rates))
+        return group.push(inverse, negate(xi))
+
+
+class Act(Operation):
+    def forward(self, group, stored, point):
+        return group.act(group.normalize(stored), point)
+
+    def reverse(self, group, arguments, cotangent):
+        stored, point = arguments
+        g, point_cotangent = group.act_reverse(group.normalize(stored), point, cotangent)
+        return group.embed(stored, g), point_cotangent
+
+    def tangent(self, group, arguments, rates):
+        stored, point = arguments
+        xi = group.extract(stored, rates[0])
+        return group.act_tangent(group.normalize(stored), point, xi, rates[1])
+
+
+class Interpolate(Operation):
+    """The geodesic from `start` (s = 0) to `end` (s = 1): a cumulative product of one step, weight s."""
+
+    def _sweep(self, group, start, end, s):
+        a, b = group.normalize(start), group.normalize(end)
+        d = group.log(group.between(a, b))
+        value, trace = forward(group, a, [d], [s], derivatives=0)
+        return d, value, trace
+
+    def forward(self, group, start, end, s):
+        return self._sweep(group, start, end, s)[1]
+
+    def reverse(self, group, arguments, cotangent):
+        start, end, s = arguments
+        d, value, trace = self._sweep(group, start, end, s)
+        g, (d_g,), (s_g,) = reverse(group, [d], [s], trace, group.pull(value, cotangent), [])
+        g = add(g, negate(group.left_jacobian_inverse_transpose(d, d_g, short=True)))
+        end_g = group.right_jacobian_inverse_transpose(d, d_g, short=True)
+        return group.embed(start, g), group.embed(end, end_g), tuple(s_g)
+
+    def tangent(self, group, arguments, rates):
+        start, end, s = arguments
+        d, value, trace = self._sweep(group, start, end, s)
+        start_rate, end_rate = group.extract(start, rates[0]), group.extract(end, rates[1])
+        d_rate = add(
+            group.right_jacobian_inverse(d, end_rate, short=True),
+            negate(group.left_jacobian_inverse(d, start_rate, short=True)),
+        )
+        xi, _ = tangent(group, [d], [s], trace, start_rate, [d_rate], [rates[2]])
+        return group.push(value, xi)
+
+
+#: A new operation is a class above, a line here and a method of `Group`.
+OPERATIONS: dict[str, Operation] = {
+    "exp": Exp(),
+    "log": Log(),
+    "compose": Compose(),
+    "inverse": Inverse(),
+    "act": Act(),
+    "interpolate": Interpolate(),
+}
+
+
+def _forward(operation: str, group: str, *arguments: Tensor) -> Tensor:
+    components = OPERATIONS[operation].forward(arithmetic(group), *map(split, arguments))
+    return join(components, arguments[0])
+
+
+def _reverse(
+    operation: str, group: str, arguments: tuple[Tensor, ...], cotangent: Tensor
+) -> tuple[Tensor, ...]:
+    components = tuple(map(split, arguments))
+    gradients = OPERATIONS[operation].reverse(arithmetic(group), components, split(cotangent))
+    return tuple(join(g, x) for g, x in zip(gradients, arguments, strict=True))
+
+
+class GroupFunction(Function):
+    """Any operation on any group, for arguments of one batch shape."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(operation: str, group: str, *arguments: Tensor) -> Tensor:
+        return _forward(operation, group, *arguments)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: Tensor) -> None:
+        ctx.operation, ctx.group, *arguments = inputs
+        ctx.save_for_backward(*arguments)
+        ctx.save_for_forward(*arguments)
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return None, None, *_reverse(ctx.operation, ctx.group, ctx.saved_tensors, cotangent)
+
+    @staticmethod
+    def jvp(ctx: Any, _operation: None, _group: None, *rates: Tensor | None) -> Tensor:  # type: ignore[override]
+        arguments = ctx.saved_tensors
+        components = tuple(map(split, arguments))
+        moved = tuple(
+            zero(x.shape[-1]) if rate is None else split(rate)
+            for x, rate in zip(arguments, rates, strict=True)
+        )
+        result = OPERATIONS[ctx.operation].tangent(arithmetic(ctx.group), components, moved)
+        return join(result, arguments[0])
+
+
+@torch.library.custom_op("torchspline::group", mutates_args=())
+def _compiled(operation: str, group: str, arguments: list[Tensor]) -> Tensor:
+    return _forward(operation, group, *arguments)
+
+
+@torch.library.custom_op("torchspline::group_reverse", mutates_args=())
+def _compiled_reverse(operation: str, group: str, arguments: list[Tensor], cotangent: Tensor) -> list[Tensor]:
+    return list(_reverse(operation, group, tuple(arguments), cotangent))
+
+
+@_compiled.register_fake
+def _(operation: str, group: str, arguments: list[Tensor]) -> Tensor:
+    sizes = arithmetic(group)
+    size = {"log": sizes.tangent_size, "act": sizes.act_size}.get(operation, sizes.point_size)
+    return arguments[0].new_empty(*arguments[0].shape[:-1], size)
+
+
+@_compiled_reverse.register_fake
+def _(operation: str, group: str, arguments: list[Tensor], cotangent: Tensor) -> list[Tensor]:
+    return [torch.empty_like(x, memory_format=torch.contiguous_format) for x in arguments]
+
+
+def _save(ctx: Any, inputs: tuple, output: Tensor) -> None:
+    ctx.operation, ctx.group, arguments = inputs
+    ctx.save_for_backward(*arguments)
+
+
+def _compiled_backward(ctx: Any, cotangent: Tensor) -> tuple:
+    return None, None, _compiled_reverse(ctx.operation, ctx.group, list(ctx.saved_tensors), cotangent)
+
+
+_compiled.register_autograd(_compiled_backward, setup_context=_save)
+
+
+def run(operation: str, group: str, *arguments: Tensor) -> Tensor:
+    """`operation` of `group`; all but the last dimension of the arguments broadcast.
+
+    Under `torch.compile` the operation is one opaque operator, since tracing through its arithmetic would take
+    the compiler minutes; everywhere else it is the autograd function, which also knows `jvp` and `vmap`.
+    """
+    batch = torch.broadcast_shapes(*(x.shape[:-1] for x in arguments))
+    arguments = tuple(x.expand(*batch, x.shape[-1]) for x in arguments)
+    if torch.compiler.is_compiling():
+        return _compiled(operation, group, list(arguments))
+    return GroupFunction.apply(operation, group, *arguments)
