@@ -109,6 +109,13 @@ def positive(name: str, x: float) -> float:
     return x
 
 
+def finite_number(name: str, x: float) -> float:
+    """A finite number."""
+    if not math.isfinite(x):
+        raise ValueError(f"{name}: expected a finite number, got {x}")
+    return x
+
+
 def choice(name: str, x: str, allowed: Sequence[str]) -> str:
     """One of the `allowed` words."""
     if x not in allowed:
@@ -116,9 +123,14 @@ def choice(name: str, x: str, allowed: Sequence[str]) -> str:
     return x
 
 
-def _truth(condition: Tensor) -> bool:
-    """Its value, or True where torch will not tell (inside `vmap`)."""
+def seen_true(condition: Tensor) -> bool | None:
+    """Its value, or None where torch will not tell (inside `vmap`)."""
     try:
         return bool(condition)
     except RuntimeError:
-        return True
+        return None
+
+
+def _truth(condition: Tensor) -> bool:
+    """Its value, or True where torch will not tell."""
+    return seen_true(condition) is not False

@@ -17,6 +17,7 @@ from torchspline.arithmetic.recurrence import forward, reverse, tangent
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import Vector, add, negate, zero
 from torchspline.groups.components import join, split
+from torchspline.groups.nested import outer_levels, primals
 
 
 class Operation(ABC):
@@ -187,14 +188,15 @@ class GroupFunction(Function):
 
     @staticmethod
     def jvp(ctx: Any, _operation: None, _group: None, *rates: Tensor | None) -> Tensor:  # type: ignore[override]
-        arguments = ctx.saved_tensors
-        components = tuple(map(split, arguments))
-        moved = tuple(
-            zero(x.shape[-1]) if rate is None else split(rate)
-            for x, rate in zip(arguments, rates, strict=True)
-        )
-        result = OPERATIONS[ctx.operation].tangent(arithmetic(ctx.group), components, moved)
-        return join(result, arguments[0])
+        with outer_levels():
+            arguments = primals(ctx.saved_tensors)
+            components = tuple(map(split, arguments))
+            moved = tuple(
+                zero(x.shape[-1]) if rate is None else split(rate)
+                for x, rate in zip(arguments, rates, strict=True)
+            )
+            result = OPERATIONS[ctx.operation].tangent(arithmetic(ctx.group), components, moved)
+            return join(result, arguments[0])
 
 
 @torch.library.custom_op("torchspline::group", mutates_args=())

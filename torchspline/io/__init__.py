@@ -1,0 +1,124 @@
+"""Reading and writing recordings: `read_poses`, `read_imu`, `write_poses`, `write_imu`.
+
+To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
+"""
+
+from os import PathLike
+from pathlib import Path
+
+from torchspline.io import euroc, kitti, tum
+from torchspline.io.records import ImuRecord, PoseRecord
+from torchspline.io.registry import Format
+from torchspline.io.text import Table, read_table
+
+__all__ = ["ImuRecord", "PoseRecord", "read_imu", "read_poses", "write_imu", "write_poses"]
+
+_FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in (euroc, kitti, tum)}
+
+
+def read_poses(
+    path: str | PathLike[str], format: str | None = None, times: str | PathLike[str] | None = None
+) -> PoseRecord:
+    """Read stamped poses, body to world: metres, quaternions [w, x, y, z], exact nanoseconds.
+
+    Args:
+        path: a file, plain or gzipped, or an EuRoC folder (the one of `data.csv`, or of the whole sequence,
+            where `state_groundtruth_estimate0` goes before `mocap0`).
+        format: "euroc", "kitti" or "tum"; found from the content when not given.
+        times: the file of stamps, for KITTI only; looked for beside the poses when not given.
+    Returns:
+        PoseRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
+    Raises:
+        FileNotFoundError: no such file, or no file of stamps.
+        ValueError: content that cannot be read as this format; the message names the file and the line.
+    """
+    table, chosen = _open(Path(path), format, "read_poses", "pose_files")
+    assert chosen.read_poses
+    if times is not None and not chosen.separate_times:
+        raise ValueError(f"{path}: {chosen.name} files hold their own stamps; leave out times={str(times)!r}")
+    return chosen.read_poses(table, None if times is None else Path(times))
+
+
+def read_imu(path: str | PathLike[str], format: str | None = None) -> ImuRecord:
+    """Read stamped IMU samples: rad/s, specific force in m/s^2, exact nanoseconds.
+
+    Args:
+        path: a file, plain or gzipped, or an EuRoC folder (the one of `data.csv`, or of the whole sequence).
+        format: "euroc"; found from the content when not given.
+    Returns:
+        ImuRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: content that cannot be read as this format; the message names the file and the line.
+    """
+    table, chosen = _open(Path(path), format, "read_imu", "imu_files")
+    assert chosen.read_imu
+    return chosen.read_imu(table)
+
+
+def write_poses(path: str | PathLike[str], record: PoseRecord, format: str = "tum") -> None:
+    """Write poses as "tum" or "euroc"; reading them back gives the same stamps and float64 numbers.
+
+    Gzipped when the name ends with .gz. An existing file is replaced.
+
+    Raises:
+        FileNotFoundError: the folder of `path` does not exist.
+        ValueError: a format that is unknown or cannot be written, a record without rows.
+    """
+    _write(Path(path), record, format, "write_poses")
+
+
+def write_imu(path: str | PathLike[str], record: ImuRecord, format: str = "euroc") -> None:
+    """Write IMU samples as an EuRoC csv; reading them back gives the same stamps and float64 numbers.
+
+    Gzipped when the name ends with .gz. An existing file is replaced.
+
+    Raises:
+        FileNotFoundError: the folder of `path` does not exist.
+        ValueError: a format that is unknown or cannot be written, a record without rows.
+    """
+    _write(Path(path), record, format, "write_imu")
+
+
+def _formats(action: str, name: str | None) -> list[Format]:
+    """The formats that can do `action`, or just the one of this name."""
+    able = {key: form for key, form in _FORMATS.items() if getattr(form, action)}
+    if name is None:
+        return list(able.values())
+    if name not in able:
+        raise ValueError(f"{action}: expected a format out of {', '.join(able)}, got {name!r}")
+    return [able[name]]
+
+
+def _open(path: Path, name: str | None, action: str, files: str) -> tuple[Table, Format]:
+    """The table at `path` and its format: the named one, else the one that recognises the table."""
+    candidates = _formats(action, name)
+    if path.is_dir():
+        path = _inside(path, [file for form in candidates for file in getattr(form, files)])
+    table = read_table(path)
+    matches = candidates if name else [form for form in candidates if form.recognises(table)]
+    if len(matches) != 1:
+        names = " or ".join(form.name for form in matches or candidates)
+        raise table.error(
+            0,
+            f"{table.columns} columns, here {table.excerpt(0)}",
+            f"rows that look like {names} (pass format= where the content does not tell which)",
+        )
+    return table, matches[0]
+
+
+def _inside(folder: Path, files: list[str]) -> Path:
+    for file in files:
+        for found in (folder / file, folder / f"{file}.gz"):
+            if found.is_file():
+                return found
+    if not files:
+        raise ValueError(f"{folder}: expected a file, got a folder")
+    raise FileNotFoundError(f"{folder}: expected a folder that holds {' or '.join(files)}")
+
+
+def _write(path: Path, record: PoseRecord | ImuRecord, name: str, action: str) -> None:
+    (form,) = _formats(action, name)
+    if not len(record):
+        raise ValueError(f"{path}: expected rows to write, got an empty record")
+    getattr(form, action)(path, record)

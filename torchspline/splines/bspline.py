@@ -1,0 +1,304 @@
+"""Uniform cumulative B-splines on any Lie group, [S20]: the function and the module."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchspline import checks
+from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
+from torchspline.groups.group import R3, SO3, Group, product
+from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, locate
+from torchspline.splines.sweep import cumulative_bspline
+from torchspline.splines.trajectory import State, Trajectory
+
+_NANOSECOND = 1e-9
+
+
+def bspline(
+    control_points: Tensor,
+    t: Tensor,
+    *,
+    group: Group,
+    order: int = 4,
+    dt: Tensor | float | None = None,
+    t0: Tensor | float = 0.0,
+    dt_ns: int | None = None,
+    t0_ns: int | None = None,
+    derivatives: int = 2,
+    extrapolate: Extrapolate = "error",
+    validate: bool = True,
+) -> State:
+    """Value and time derivatives of a uniform B-spline, [S20] Theorems 5.2, 5.3 and (75). O(order) per query.
+
+    Args:
+        control_points: `(*batch, M, P)` points of `group`, M >= order, float32 or float64. Quaternions may have any
+            length and sign; neighbours are joined the short way round.
+        t: seconds (float64, or float32 while its rounding stays below dt/1000), or int64 nanoseconds together with
+            `t0_ns` and `dt_ns`. Shape `()`, `(N,)`, shared by the batch, or `(*batch, N)`; batches broadcast.
+        order: k >= 2; the curve is C^(k-2), of degree k - 1 on R^n. Corrects [S20] 4.1, which says C^(k-1).
+        dt, t0: knot spacing and start of the domain `[t0, t0 + (M - order + 1) dt]` in seconds, numbers or 0-dim
+            tensors.
+        derivatives: how many, 0 to 3.
+        extrapolate: outside the domain "error"; "clamp": the end pose, zero derivatives; "linear": the end
+            velocity kept.
+        validate: look at values (finite numbers, quaternion lengths, times inside). Only done on the CPU in eager
+            mode; elsewhere a time outside gives NaN. With False, times outside are undefined.
+    Returns:
+        State: `value` (*batch, N, P), quaternions unit and of continuous sign; `velocity`, `acceleration`, `jerk`
+        (*batch, N, D), body frame, per second. A scalar time drops N.
+    Differentiable in control points, float `t`, `dt` and `t0`, to any order; not at knots in derivatives that jump
+    there, nor where neighbours are exactly pi apart.
+    Raises:
+        TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
+    """
+    group = _as_group(group)
+    _check_control_points(control_points, group, order, validate)
+    if not isinstance(derivatives, int) or not 0 <= derivatives <= MAX_DERIVATIVES:
+        raise ValueError(f"derivatives: expected 0 to {MAX_DERIVATIVES}, got {derivatives!r}")
+    checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
+    start, spacing, seconds = _knots(t, dt, t0, dt_ns, t0_ns)
+    _check_times(t, control_points, validate)
+
+    segments = control_points.shape[-2] - order + 1
+    control_points, times, shape = _align(control_points, t)
+    place = locate(times, start, spacing, segments, extrapolate, validate)
+    # Extrapolating linearly needs the velocity even where only the value is asked for.
+    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
+    u = place.u.to(control_points.dtype)
+    fields = cumulative_bspline(control_points, u, place.index, group.name, order, needed)
+    if place.beyond is not None:
+        fields = _beyond(group, fields, place, extrapolate)
+    fields = fields[: derivatives + 1]
+    scaled = [field if r == 0 else field / seconds**r for r, field in enumerate(fields)]
+    return State(*(field.reshape(*shape, field.shape[-1]) for field in scaled))
+
+
+def _as_group(group: Group) -> Group:
+    if not isinstance(group, Group):
+        raise TypeError(
+            f"group: expected a torchspline.Group such as torchspline.SE3, got {type(group).__name__}"
+        )
+    return group
+
+
+def _check_control_points(control_points: Tensor, group: Group, order: int, validate: bool) -> None:
+    checks.is_floating_tensor("control_points", control_points)
+    if isinstance(order, bool) or not isinstance(order, int) or order < 2:
+        raise ValueError(f"order: expected a whole number of at least 2, got {order!r}")
+    if control_points.ndim < 2 or control_points.shape[-1] != group.point_size:
+        raise ValueError(
+            f"control_points: expected shape (..., M, {group.point_size}), M points of {group}, "
+            f"got {tuple(control_points.shape)}"
+        )
+    if control_points.shape[-2] < order:
+        raise ValueError(
+            f"control_points: order {order} needs at least {order} control points, got {control_points.shape[-2]}"
+        )
+    if validate:
+        checks.finite("control_points", control_points)
+        checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
+
+
+def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any, Any]:
+    """Start and spacing in the unit of the times, and the spacing in seconds."""
+    if not isinstance(t, Tensor):
+        raise TypeError(
+            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
+        )
+    if dt_ns is not None or t0_ns is not None:
+        if dt is not None or dt_ns is None:
+            raise ValueError("dt_ns, t0_ns: nanoseconds are used as a whole: give dt_ns and t0_ns, and no dt")
+        for name, x in (("dt_ns", dt_ns), ("t0_ns", 0 if t0_ns is None else t0_ns)):
+            if isinstance(x, bool) or not isinstance(x, int):
+                raise TypeError(f"{name}: expected a whole number of nanoseconds, got {x!r}")
+        if t.dtype != torch.int64:
+            raise TypeError(f"t: with dt_ns, times are int64 nanoseconds, got {t.dtype}")
+        checks.positive("dt_ns", dt_ns)
+        return t0_ns or 0, dt_ns, dt_ns * _NANOSECOND
+    if dt is None:
+        raise ValueError("dt: the knot spacing is missing; give dt in seconds, or dt_ns and t0_ns")
+    if t.dtype == torch.int64:
+        raise TypeError("t: int64 times are nanoseconds and go with dt_ns and t0_ns; got dt in seconds")
+    checks.is_floating_tensor("t", t)
+    return _seconds("t0", t0, t), _seconds("dt", dt, t, positive=True), dt
+
+
+def _seconds(name: str, x: Any, t: Tensor, positive: bool = False) -> Any:
+    if isinstance(x, Tensor):
+        checks.is_floating_tensor(name, x)
+        if x.ndim != 0:
+            raise ValueError(f"{name}: expected one number (a 0-dim tensor), got shape {tuple(x.shape)}")
+        if x.device != t.device:
+            raise ValueError(
+                f"{name}: on device {x.device}, but t is on {t.device}; move one with .to(device)"
+            )
+        checks.finite(name, x)
+        if positive and checks.values_visible(x) and checks.seen_true(x.detach() <= 0):
+            raise ValueError(f"{name}: expected a number above zero, got {x.item()}")
+        return x.to(torch.float64)
+    if isinstance(x, bool) or not isinstance(x, (int, float)):
+        raise TypeError(f"{name}: expected seconds as a number or a 0-dim tensor, got {type(x).__name__}")
+    if positive:
+        return checks.positive(name, float(x))
+    return checks.finite_number(name, float(x))
+
+
+def _check_times(t: Tensor, control_points: Tensor, validate: bool) -> None:
+    if t.device != control_points.device:
+        raise ValueError(
+            f"t: on device {t.device}, but control_points are on {control_points.device}; move one with .to(device)"
+        )
+    if t.ndim > 1:
+        checks.broadcast(control_points=control_points.shape[:-2], t=t.shape[:-1])
+    if validate and t.dtype != torch.int64:
+        checks.finite("t", t)
+
+
+def _align(control_points: Tensor, t: Tensor) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Control points and times as the sweep wants them, and the shape of the results without components."""
+    batch = control_points.shape[:-2]
+    if t.ndim == 0:
+        return control_points, t.reshape(1), tuple(batch)
+    if t.ndim == 1:
+        return control_points, t, (*batch, t.shape[0])
+    if len(batch) == 0:  # one trajectory: a batch of times is just more times
+        return control_points, t.reshape(-1), tuple(t.shape)
+    common = torch.broadcast_shapes(batch, t.shape[:-1])
+    expanded = control_points.expand(*common, *control_points.shape[-2:])
+    return expanded, t.expand(*common, t.shape[-1]), (*common, t.shape[-1])
+
+
+def _beyond(
+    group: Group, fields: tuple[Tensor, ...], place: Located, extrapolate: Extrapolate
+) -> tuple[Tensor, ...]:
+    """Past an end: hold the pose, or keep the velocity there."""
+    assert place.beyond is not None
+    value, *rates = fields
+    excess = place.beyond.to(value.dtype).unsqueeze(-1)
+    outside = excess != 0
+    if extrapolate == "linear":
+        drift = group.exp(excess * rates[0], validate=False)
+        value = group.compose(value, drift, validate=False)
+        held = [rates[0]]
+    else:
+        held = []
+    return value, *held, *(torch.where(outside, 0.0, rate) for rate in rates[len(held) :])
+
+
+class BSpline(Trajectory):
+    """A uniform cumulative B-spline as a layer: control points in, motion at any time out. See `bspline`.
+
+    Args:
+        control_points: `(*batch, M, P)`. A tensor that requires grad (a network's output, the caller's own leaf) is
+            used as given; any other becomes a `Parameter`, or a buffer if not `learnable`.
+        group, order, extrapolate, validate: as in `bspline`.
+        dt, t0: seconds, kept in float64 through `.to(dtype)`; tensors that require grad are used as given.
+        dt_ns, t0_ns: whole nanoseconds instead; times are then int64.
+        learnable: whether control points that do not require grad become a `Parameter`.
+    """
+
+    def __init__(
+        self,
+        control_points: Tensor,
+        *,
+        group: Group,
+        order: int = 4,
+        dt: Tensor | float | None = None,
+        t0: Tensor | float = 0.0,
+        dt_ns: int | None = None,
+        t0_ns: int | None = None,
+        learnable: bool = True,
+        extrapolate: Extrapolate = "error",
+        validate: bool = True,
+    ):
+        super().__init__()
+        self.group = _as_group(group)
+        _check_control_points(control_points, group, order, validate=True)
+        checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
+        self.order, self.extrapolate, self.validate = order, extrapolate, validate
+        self.control_points: Tensor
+        if control_points.requires_grad or not learnable:
+            self.register_tensor("control_points", control_points)
+        else:
+            self.control_points = nn.Parameter(control_points)
+        nanoseconds = dt_ns is not None or t0_ns is not None
+        probe = torch.zeros(
+            (), dtype=torch.int64 if nanoseconds else torch.float64, device=control_points.device
+        )
+        _knots(probe, dt, t0, dt_ns, t0_ns)  # the errors of the arguments, now rather than at the first call
+        self.dt_ns, self.t0_ns = dt_ns, (t0_ns or 0) if nanoseconds else None
+        self.dt: Tensor | None = None
+        self.t0: Tensor | None = None
+        if not nanoseconds:
+            for name, x in (("dt", dt), ("t0", t0)):
+                if not isinstance(x, Tensor) or not x.requires_grad:
+                    x = torch.as_tensor(x, dtype=torch.float64, device=control_points.device)
+                self.register_tensor(name, x)
+
+    def register_tensor(self, name: str, x: Tensor) -> None:
+        """Keep `x` under `name`: a `Parameter` as one, anything else as a buffer, which may carry a graph."""
+        self.__dict__.pop(name, None)
+        if isinstance(x, nn.Parameter):
+            self.register_parameter(name, x)
+        else:
+            self.register_buffer(name, x)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> "BSpline":
+        """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
+        kept = {name: getattr(self, name) for name in ("dt", "t0") if getattr(self, name, None) is not None}
+        super()._apply(fn, recurse)
+        for name, old in kept.items():
+            new = getattr(self, name)
+            if new.dtype == old.dtype:
+                continue
+            restored = old.to(new.device)
+            if isinstance(new, nn.Parameter):
+                new.data = restored.detach()
+            else:
+                setattr(self, name, restored)
+        return self
+
+    @property
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last time: seconds, or nanoseconds if made with `dt_ns`."""
+        segments = self.control_points.shape[-2] - self.order + 1
+        if self.dt_ns is not None:
+            assert self.t0_ns is not None
+            return self.t0_ns, self.t0_ns + segments * self.dt_ns
+        assert self.dt is not None
+        assert self.t0 is not None
+        t0, dt = float(self.t0.detach()), float(self.dt.detach())
+        return t0, t0 + segments * dt
+
+    def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
+        """Value and time derivatives at the times `t`; see `bspline` for shapes, frames, units and errors."""
+        return bspline(
+            self.control_points,
+            t,
+            group=self.group,
+            order=self.order,
+            dt=self.dt,
+            t0=0.0 if self.t0 is None else self.t0,
+            dt_ns=self.dt_ns,
+            t0_ns=self.t0_ns,
+            derivatives=derivatives,
+            extrapolate=self.extrapolate,  # type: ignore[arg-type]
+            validate=self.validate,
+        )
+
+    def extra_repr(self) -> str:
+        start, end = self.domain
+        unit = "s" if self.dt_ns is None else "ns"
+        batch, points = tuple(self.control_points.shape[:-2]), self.control_points.shape[-2]
+        return f"{self.group}, order={self.order}, batch={batch}, points={points}, domain=[{start}, {end}] {unit}"
+
+
+class SplitBSpline(BSpline):
+    """A B-spline of split poses `[x, y, z, qw, qx, qy, qz]`: position in R3 and rotation in SO3, interpolated apart.
+
+    [S20] and [H18] both find it as accurate as SE(3) and cheaper: `BSpline` on the group `R3xSO3`.
+    """
+
+    def __init__(self, control_points: Tensor, **options: Any):
+        super().__init__(control_points, group=product(R3, SO3), **options)

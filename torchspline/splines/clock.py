@@ -1,0 +1,104 @@
+"""From times to segments of uniform knots: all time arithmetic of the library, in float64 or whole nanoseconds."""
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+
+Extrapolate = Literal["error", "clamp", "linear"]
+EXTRAPOLATE: tuple[str, ...] = ("error", "clamp", "linear")
+
+
+class Located(NamedTuple):
+    """Where times fall, each of the shape of the times."""
+
+    #: Segment, int64, and place within it in [0, 1] (float64).
+    index: Tensor
+    u: Tensor
+    #: How far before the start (negative) or past the end a time lies, in knot spacings; None if none may.
+    beyond: Tensor | None
+
+
+def locate(
+    t: Tensor,
+    t0: Tensor | float | int,
+    dt: Tensor | float | int,
+    segments: int,
+    extrapolate: Extrapolate,
+    validate: bool,
+) -> Located:
+    """Segment and place within it, computed before any rounding to float32.
+
+    Args:
+        t: seconds (float) with `t0`, `dt` in seconds, or whole nanoseconds (int64) with both in nanoseconds.
+        segments: the domain is `[t0, t0 + segments dt]`; a few rounding errors beyond belong to it.
+    Raises:
+        ValueError: see `_check_domain` and `_check_float32`. Where values cannot be seen (other devices, `vmap`,
+            compilation) times outside give NaN instead.
+    """
+    if t.dtype == torch.int64:
+        elapsed = t - t0
+        index = elapsed.div(dt, rounding_mode="floor").clamp(0, segments - 1)
+        within = (elapsed - index * dt).to(torch.float64)
+        u = within / (dt.to(torch.float64) if isinstance(dt, Tensor) else float(dt))
+        tolerance = 0.0
+    else:
+        if validate:
+            _check_float32(t, dt)
+        s = (t.to(torch.float64) - t0) / dt
+        index = s.detach().floor().clamp(0, segments - 1).nan_to_num().to(torch.int64)
+        u = s - index
+        tolerance = _tolerance(t, t0, dt, segments)
+    if extrapolate != "error":
+        inside = u.clamp(0.0, 1.0)
+        return Located(index, inside, u - inside)
+    if validate:
+        outside = (u.detach() < -tolerance) | (u.detach() > 1.0 + tolerance) | u.detach().isnan()
+        if _none_outside(t, t0, dt, segments, outside) is None:
+            u = torch.where(outside, torch.nan, u)
+    return Located(index, u, None)
+
+
+def _tolerance(t: Tensor, t0: Tensor | float, dt: Tensor | float, segments: int) -> Tensor | float:
+    """A few rounding errors of the times, in knot spacings."""
+    largest = t.detach().abs().to(torch.float64).clamp_min(1e-300) + abs(_detach(t0))
+    largest = largest + segments * abs(_detach(dt))
+    return (4.0 * torch.finfo(t.dtype).eps * largest / _detach(dt)).clamp_max(1e-2)
+
+
+def _detach(x: Tensor | float) -> Tensor | float:
+    return x.detach() if isinstance(x, Tensor) else x
+
+
+def _check_float32(t: Tensor, dt: Tensor | float) -> None:
+    """float32 seconds are welcome while their rounding is far below the knot spacing."""
+    if t.dtype != torch.float32 or t.numel() == 0 or not checks.values_visible(t):
+        return
+    rounding = torch.finfo(torch.float32).eps * t.detach().abs().amax()
+    if checks.seen_true(rounding.to(torch.float64) > 1e-3 * _detach(dt)):
+        raise ValueError(
+            f"t: float32 rounds times near {t.detach().abs().amax().item():.6g} s to {rounding.item():.1e} s, more than "
+            f"a thousandth of dt = {float(dt):g} s; pass float64 times, int64 nanoseconds, or times relative to a "
+            "nearer origin"
+        )
+
+
+def _none_outside(
+    t: Tensor, t0: Tensor | float | int, dt: Tensor | float | int, segments: int, outside: Tensor
+) -> bool | None:
+    """True if no time is outside, an error if one is, None where values cannot be seen."""
+    if not checks.values_visible(t, outside):
+        return None
+    seen = checks.seen_true(outside.any())
+    if not seen:
+        return None if seen is None else True
+    unit = "ns" if t.dtype == torch.int64 else "s"
+    first = t.detach()[outside].flatten()[0].item()
+    end = _detach(t0) + segments * _detach(dt)
+    start, stop = (x.item() if isinstance(x, Tensor) else x for x in (_detach(t0), end))
+    raise ValueError(
+        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] {unit}, the first "
+        f"is {first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
+    )

@@ -1,0 +1,199 @@
+"""What every trajectory answers, whatever it is made of."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchspline import checks
+from torchspline.groups.group import SE3, SO3, Group
+
+
+class State(NamedTuple):
+    """Value and time derivatives; those not asked for are None.
+
+    `velocity` is the body-frame tangent `X^-1 dX/dt` per second (for the R^n part of a product that is the plain
+    world-frame rate), `acceleration` and `jerk` its derivatives by time.
+    """
+
+    value: Tensor
+    velocity: Tensor | None = None
+    acceleration: Tensor | None = None
+    jerk: Tensor | None = None
+
+
+class Kinematics(NamedTuple):
+    """Motion in the terms of mechanics; what the group does not have (a rotation of R3) is None.
+
+    `rotation` (..., 4) quaternion [w, x, y, z], body to world; `position` (..., 3), `velocity`, `acceleration` of the
+    body origin in the world frame, m, m/s, m/s^2; `angular_velocity`, `angular_acceleration` in the body frame,
+    rad/s, rad/s^2.
+    """
+
+    rotation: Tensor | None
+    position: Tensor | None
+    velocity: Tensor | None
+    acceleration: Tensor | None
+    angular_velocity: Tensor | None
+    angular_acceleration: Tensor | None
+
+
+def _of_so3(s: State) -> Kinematics:
+    return Kinematics(s.value, None, None, None, s.velocity, s.acceleration)
+
+
+def _of_r3(s: State) -> Kinematics:
+    return Kinematics(None, s.value, s.velocity, s.acceleration, None, None)
+
+
+def _of_split(s: State) -> Kinematics:
+    assert s.velocity is not None
+    assert s.acceleration is not None
+    return Kinematics(
+        s.value[..., 3:], s.value[..., :3], s.velocity[..., :3], s.acceleration[..., :3],
+        s.velocity[..., 3:], s.acceleration[..., 3:],
+    )  # fmt: skip
+
+
+def _of_se3(s: State) -> Kinematics:
+    """[S20] (33) and (40): the translation column of X (w^ w^ + a^)."""
+    assert s.velocity is not None
+    assert s.acceleration is not None
+    q, (v, w), a = s.value[..., 3:], s.velocity.split(3, -1), s.acceleration
+    velocity = SO3.act(q, v, validate=False)
+    acceleration = SO3.act(q, torch.linalg.cross(w, v) + a[..., :3], validate=False)
+    return Kinematics(q, s.value[..., :3], velocity, acceleration, w, a[..., 3:])
+
+
+#: How the states of a group read as motion; a group that moves a rigid body adds its line here.
+MECHANICS: dict[str, Callable[[State], Kinematics]] = {
+    "SO3": _of_so3,
+    "R3": _of_r3,
+    "R3xSO3": _of_split,
+    "SE3": _of_se3,
+}
+
+
+class Trajectory(nn.Module, ABC):
+    """A curve in a Lie group over an interval of time."""
+
+    #: The group its values live in.
+    group: Group
+
+    @property
+    @abstractmethod
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last time that belong to it, in seconds, or in nanoseconds where times are int64."""
+
+    @abstractmethod
+    def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
+        """Value and time derivatives (0 to 3 of them) at the times `t`."""
+
+    def forward(self, t: Tensor) -> Tensor:
+        """Values at the times `t`, `(*batch, N, P)`."""
+        return self.evaluate(t, derivatives=0).value
+
+    def kinematics(self, t: Tensor) -> Kinematics:
+        """Rotation, position and their rates at the times `t`.
+
+        Raises:
+            ValueError: the group is not one of SO3, R3, R3xSO3, SE3.
+        """
+        if self.group.name not in MECHANICS:
+            raise ValueError(
+                f"kinematics: {self.group} does not describe the motion of a body; expected one of "
+                f"{', '.join(MECHANICS)}"
+            )
+        return MECHANICS[self.group.name](self.evaluate(t, derivatives=2))
+
+    def mounted(self, T_body_sensor: Tensor) -> "Trajectory":
+        """The same motion as seen from a frame that is rigidly attached to the body, lever arm included.
+
+        Args:
+            T_body_sensor: SE3 pose (7,) [x, y, z, qw, qx, qy, qz] of the frame in the body, or `(*batch, 7)` for
+                trajectories of that batch. One that requires grad is used as given.
+        Returns:
+            A trajectory of the same group and domain.
+        """
+        return Mounted(self, T_body_sensor)
+
+
+class Mounted(Trajectory):
+    """A trajectory shifted to a frame on the same rigid body: values `X(t) T`."""
+
+    def __init__(self, trajectory: Trajectory, T_body_sensor: Tensor):
+        super().__init__()
+        if not isinstance(trajectory, Trajectory):
+            raise TypeError(f"trajectory: expected a Trajectory, got {type(trajectory).__name__}")
+        if trajectory.group.name not in _ATTACH:
+            raise ValueError(
+                f"mounted: a frame cannot be attached to a trajectory in {trajectory.group}; expected one of "
+                f"{', '.join(_ATTACH)}"
+            )
+        checks.is_floating_tensor("T_body_sensor", T_body_sensor)
+        checks.has_last("T_body_sensor", T_body_sensor, 7, "an SE3 pose")
+        checks.finite("T_body_sensor", T_body_sensor)
+        checks.quaternions("T_body_sensor", T_body_sensor, ((3, 7),))
+        self.trajectory = trajectory
+        self.group = trajectory.group
+        self.register_buffer("T_body_sensor", T_body_sensor)
+        self.T_body_sensor: Tensor
+
+    @property
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        return self.trajectory.domain
+
+    def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
+        """Value and time derivatives of the attached frame, see `Trajectory.evaluate`."""
+        state = self.trajectory.evaluate(t, derivatives)
+        T = self.T_body_sensor
+        checks.same_kind(trajectory=state.value, T_body_sensor=T)
+        if state.value.ndim > T.ndim:  # the times come between the batch and the components
+            T = T.unsqueeze(-2) if T.ndim > 1 else T
+        return _ATTACH[self.group.name](state, T)
+
+
+def _attach_se3(s: State, T: Tensor) -> State:
+    """T is constant, so every rate is just seen from the other frame: Ad_{T^-1}."""
+    back = SE3.inverse(T, validate=False)
+    rates = (None if r is None else SE3.adjoint_act(back, r, validate=False) for r in s[1:])
+    return State(SE3.compose(s.value, T, validate=False), *rates)
+
+
+def _attach_so3(s: State, T: Tensor) -> State:
+    q = T[..., 3:]
+    back = SO3.inverse(q, validate=False)
+    rates = (None if r is None else SO3.act(back, r, validate=False) for r in s[1:])
+    return State(SO3.compose(s.value, q, validate=False), *rates)
+
+
+def _attach_split(s: State, T: Tensor) -> State:
+    """Rigid-body transport of position rates over the lever arm; rotations as in SO3."""
+    rotation = _attach_so3(State(*(None if x is None else x[..., 3:] for x in s)), T)  # type: ignore[arg-type]
+    q, arm = s.value[..., 3:], T[..., :3].expand(*s.value.shape[:-1], 3)
+    cross = torch.linalg.cross
+    offsets = [arm]
+    if s.velocity is not None:
+        w = s.velocity[..., 3:]
+        offsets.append(cross(w, arm))
+    if s.acceleration is not None:
+        a = s.acceleration[..., 3:]
+        offsets.append(cross(a, arm) + cross(w, offsets[1]))
+    if s.jerk is not None:
+        body_rate = cross(s.jerk[..., 3:], arm) + cross(a, offsets[1]) + cross(w, cross(a, arm))
+        offsets.append(cross(w, offsets[2]) + body_rate)
+    joined = [
+        torch.cat([x[..., :3] + SO3.act(q, offset, validate=False), r], dim=-1)
+        for x, offset, r in zip(s, offsets, rotation, strict=False)
+        if x is not None and r is not None
+    ]
+    return State(*joined)
+
+
+_ATTACH: dict[str, Callable[[State, Tensor], State]] = {
+    "SO3": _attach_so3,
+    "R3xSO3": _attach_split,
+    "SE3": _attach_se3,
+}
