@@ -1,8 +1,20 @@
 """torchspline: continuous-time motion as a PyTorch layer."""
 
-from torchspline import functional
-from torchspline.groups import R3, SE3, SO3, Group, Rn, product
-from torchspline.splines import BSpline, Kinematics, SplitBSpline, State, Trajectory
+from torchspline import functional, imu
+from torchspline.fit import PoseFit, fit_poses
+from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
+from torchspline.splines import (
+    BSpline,
+    Kinematics,
+    SplitBSpline,
+    State,
+    Trajectory,
+    consistent_signs,
+    initial_control_points,
+    phantom_points,
+)
+
+__version__ = "0.1.0"
 
 __all__ = [
     "R3",
@@ -11,10 +23,17 @@ __all__ = [
     "BSpline",
     "Group",
     "Kinematics",
+    "PoseFit",
     "Rn",
     "SplitBSpline",
     "State",
     "Trajectory",
+    "consistent_signs",
+    "convert",
+    "fit_poses",
     "functional",
+    "imu",
+    "initial_control_points",
+    "phantom_points",
     "product",
 ]

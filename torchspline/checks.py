@@ -2,9 +2,21 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+
+
+class HasPoints(Protocol):
+    """What `points` wants to know of a group; this module lies below the groups."""
+
+    @property
+    def point_size(self) -> int: ...
+
+    @property
+    def arithmetic(self) -> Any: ...
+
 
 #: Quaternions may have any length in this range; beyond it their squares leave the range of float32.
 SHORTEST_QUATERNION, LONGEST_QUATERNION = 1e-15, 1e15
@@ -86,6 +98,19 @@ def quaternions(name: str, x: Tensor, blocks: Sequence[tuple[int, int]]) -> None
             f"{SHORTEST_QUATERNION:g} and {LONGEST_QUATERNION:g}, got length {length[where].item():g} "
             f"at index {where}"
         )
+
+
+def points(name: str, x: Tensor, group: "HasPoints", least: int) -> None:
+    """A sequence `(*batch, M, P)` of at least `least` points of `group`, finite, with usable quaternions."""
+    is_floating_tensor(name, x)
+    if x.ndim < 2 or x.shape[-1] != group.point_size:
+        raise ValueError(
+            f"{name}: expected shape (..., M, {group.point_size}), M points of {group}, got {tuple(x.shape)}"
+        )
+    if x.shape[-2] < least:
+        raise ValueError(f"{name}: expected at least {least} points of {group}, got {x.shape[-2]}")
+    finite(name, x)
+    quaternions(name, x, group.arithmetic.sign_blocks)
 
 
 def close_matrices(name: str, x: Tensor, valid: Tensor, tolerance: float) -> None:

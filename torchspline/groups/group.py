@@ -171,8 +171,9 @@ class Group:
     def adjoint_act(self, point: Tensor, tangent: Tensor, *, validate: bool = True) -> Tensor:
         """Ad_X v without forming the matrix."""
         self._accept(validate, point=(point, "point"), tangent=(tangent, "tangent"))
+        batch = torch.broadcast_shapes(point.shape[:-1], tangent.shape[:-1])
         X = self.arithmetic.normalize(split(point))
-        return join(self.arithmetic.adjoint(X, split(tangent)), tangent)
+        return join(self.arithmetic.adjoint(X, split(tangent)), tangent.expand(*batch, self.tangent_size))
 
     def bracket(self, a: Tensor, b: Tensor, *, validate: bool = True) -> Tensor:
         """The Lie bracket `[a, b] = ad_a b` of tangents; corrects [S20] (6), which should read V W - W V."""

@@ -1,6 +1,16 @@
 """Spline families on Lie groups."""
 
 from torchspline.splines.bspline import BSpline, SplitBSpline
+from torchspline.splines.keyframes import consistent_signs, initial_control_points, phantom_points
 from torchspline.splines.trajectory import Kinematics, State, Trajectory
 
-__all__ = ["BSpline", "Kinematics", "SplitBSpline", "State", "Trajectory"]
+__all__ = [
+    "BSpline",
+    "Kinematics",
+    "SplitBSpline",
+    "State",
+    "Trajectory",
+    "consistent_signs",
+    "initial_control_points",
+    "phantom_points",
+]

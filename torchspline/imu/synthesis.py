@@ -1,0 +1,76 @@
+"""Ideal inertial readings of a trajectory, [S20] (69)-(70)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.groups.group import SO3
+from torchspline.splines.trajectory import Trajectory
+
+#: Standard gravity as an acceleration in a world whose z axis points up, m/s^2.
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+class ImuReading(NamedTuple):
+    """`gyroscope` (..., N, 3) rad/s and `accelerometer` (..., N, 3) specific force m/s^2, in the IMU's frame."""
+
+    gyroscope: Tensor
+    accelerometer: Tensor
+
+
+def measure(
+    trajectory: Trajectory,
+    t: Tensor,
+    gravity: Tensor | Sequence[float] = STANDARD_GRAVITY,
+    gyroscope_bias: Tensor | Sequence[float] | None = None,
+    accelerometer_bias: Tensor | Sequence[float] | None = None,
+    T_body_imu: Tensor | None = None,
+) -> ImuReading:
+    """What a perfect IMU on the moving body reads: `w + b_g` and `R^T (a - g) + b_a`, [S20] (69)-(70).
+
+    Args:
+        trajectory: of a rigid body with rotation and position: SE3 or R3xSO3.
+        t: times as the trajectory takes them.
+        gravity: acceleration in the world, (3,) m/s^2, opposite in sign to the g of [S20] (70). KITTI's y axis points
+            down: (0, 9.80665, 0).
+        gyroscope_bias, accelerometer_bias: added to the readings, rad/s and m/s^2, (3,) or broadcasting with
+            (..., N, 3).
+        T_body_imu: SE3 pose (7,) of the IMU in the body; its lever arm enters through angular rates. None: the body
+            frame is the IMU's.
+    Differentiable in control points, times, gravity, biases and T_body_imu.
+    Raises:
+        TypeError, ValueError: a wrong type, shape or value, or a trajectory without rotation or position.
+    """
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"trajectory: expected a Trajectory, got {type(trajectory).__name__}")
+    if T_body_imu is not None:
+        trajectory = trajectory.mounted(T_body_imu)
+    motion = trajectory.kinematics(t)
+    if motion.rotation is None or motion.acceleration is None or motion.angular_velocity is None:
+        raise ValueError(
+            f"trajectory: an IMU needs rotation and position, but this one is in {trajectory.group}; "
+            "use SE3 or R3xSO3"
+        )
+    world = motion.acceleration - _vector("gravity", gravity, motion.acceleration)
+    accelerometer = SO3.act(SO3.inverse(motion.rotation, validate=False), world, validate=False)
+    gyroscope = motion.angular_velocity
+    if gyroscope_bias is not None:
+        gyroscope = gyroscope + _vector("gyroscope_bias", gyroscope_bias, gyroscope)
+    if accelerometer_bias is not None:
+        accelerometer = accelerometer + _vector("accelerometer_bias", accelerometer_bias, accelerometer)
+    return ImuReading(gyroscope, accelerometer)
+
+
+def _vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    if isinstance(x, Tensor):
+        checks.is_floating_tensor(name, x)
+        checks.same_kind(trajectory=like, **{name: x})
+    else:
+        x = torch.tensor(x, dtype=like.dtype, device=like.device)
+    checks.has_last(name, x, 3, "x, y, z")
+    checks.finite(name, x)
+    checks.broadcast(**{name: x.shape, "readings": like.shape})
+    return x

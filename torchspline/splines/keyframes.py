@@ -1,0 +1,115 @@
+"""From poses one has to control points: start and end at given poses, or a first guess for a fit."""
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.groups.group import Group
+from torchspline.splines.basis import blending_matrix
+from torchspline.splines.sweep import cumulative_bspline
+
+#: The correction of a phantom point converges linearly, at about 0.1 an iteration for rotations of 0.5 rad between keyframes.
+_CORRECTIONS = 20
+
+
+def consistent_signs(points: Tensor, group: Group) -> Tensor:
+    """The same points `(*batch, M, P)`, unit, each quaternion on the side of its predecessor.
+
+    A rotation has two quaternions; component-wise filters, plots and fits need neighbours that do not jump between
+    them.
+    """
+    checks.points("points", points, group, least=1)
+    # An order-2 spline passes through its control points and already keeps signs continuous.
+    if points.shape[-2] == 1:
+        return group.normalize(points, validate=False)
+    count = points.shape[-2]
+    index = torch.arange(count, device=points.device).clamp(max=count - 2)
+    u = (torch.arange(count, device=points.device) - index).to(points.dtype)
+    return cumulative_bspline(points, u, index, group.name, 2, 0)[0]
+
+
+def phantom_points(keyframes: Tensor, group: Group, order: int = 4) -> Tensor:
+    """Control points of a B-spline that starts exactly at the first and ends exactly at the last keyframe.
+
+    The keyframes are the inner control points; before the first and after the last one stand
+    `ceil((order - 2) / 2)` phantom points ([H18] section 3): the neighbours mirrored in the end keyframe. Above
+    order 4 that is exact on commutative groups only; elsewhere the innermost phantom point is corrected until the
+    end pose is met to rounding.
+
+    Args:
+        keyframes: `(*batch, M, P)`, M >= max(2, order - 2).
+    Returns:
+        `(*batch, M + 2 ceil((order - 2) / 2), P)`. An even order then spans M - 1 knot intervals from keyframe to
+        keyframe, an odd one M.
+    """
+    blending_matrix(order)  # the error of a bad order
+    pad = (order - 1) // 2
+    checks.points("keyframes", keyframes, group, least=max(2, order - 2))
+    if pad == 0:
+        return keyframes
+    front = _phantoms(keyframes[..., : pad + 1, :], group, order, at_end=False)
+    back = _phantoms(keyframes[..., -pad - 1 :, :], group, order, at_end=True)
+    return torch.cat([front, keyframes, back], dim=-2)
+
+
+def _phantoms(near: Tensor, group: Group, order: int, at_end: bool) -> Tensor:
+    """Phantom points before the first, or after the last, of the `pad + 1` points `near`, in order of time.
+
+    A B-spline on a non-commutative group does not read the same backwards, so both ends are treated as they are.
+    """
+    pad = near.shape[-2] - 1
+    corner = near[..., -1:, :] if at_end else near[..., :1, :]
+    if order == 3:
+        # The domain begins and ends halfway between phantom point and keyframe: they have to coincide.
+        return corner
+    others = near[..., :-1, :] if at_end else near[..., 1:, :]
+    mirrored = group.compose(corner, group.inverse(group.between(corner, others))).flip(-2)
+    points = torch.cat([near, mirrored] if at_end else [mirrored, near], dim=-2)
+    if order == 4:
+        return mirrored  # three points on one geodesic: already exact
+    if points.shape[-2] < order:  # an even order: the far control point has no weight at the end
+        far = points[..., :1, :] if at_end else points[..., -1:, :]
+        points = torch.cat([far, points] if at_end else [points, far], dim=-2)
+    inner = order - pad if at_end else pad - 1
+    weight = float(blending_matrix(order)[pad - 1][0])
+    index = torch.zeros(1, dtype=torch.int64, device=near.device)
+    u = torch.full((1,), float(at_end), dtype=near.dtype, device=near.device)
+    for _ in range(_CORRECTIONS):
+        met = cumulative_bspline(points, u, index, group.name, order, 0)[0]
+        miss = group.log(group.between(met, corner))
+        moved = group.retract(points[..., inner : inner + 1, :], miss / weight, side="right")
+        points = torch.cat([points[..., :inner, :], moved, points[..., inner + 1 :, :]], dim=-2)
+    return points[..., -pad:, :] if at_end else points[..., :pad, :]
+
+
+def initial_control_points(
+    t: Tensor, poses: Tensor, *, group: Group, order: int, dt: float, t0: float, count: int
+) -> Tensor:
+    """A first guess of control points: timed poses interpolated geodesically where control points act.
+
+    Control point i has its largest influence at `t0 + (i - (order - 2) / 2) dt`; before the first and after the last
+    pose the end pose is held.
+
+    Args:
+        t: `(N,)` seconds, increasing; `poses`: `(N, P)`.
+    Returns:
+        `(count, P)`, unit, quaternion signs consistent.
+    """
+    checks.is_floating_tensor("t", t)
+    checks.points("poses", poses, group, least=1)
+    if t.shape != poses.shape[:1] or poses.ndim != 2:
+        raise ValueError(
+            f"t, poses: expected shapes (N,) and (N, P), got {tuple(t.shape)} and {tuple(poses.shape)}"
+        )
+    if poses.shape[0] > 1 and checks.seen_true((t.diff() <= 0).any()):
+        raise ValueError("t: expected increasing times; sort them and drop duplicates first")
+    checks.positive("dt", dt)
+    peaks = t0 + (torch.arange(count, dtype=torch.float64, device=t.device) - (order - 2) / 2) * dt
+    if poses.shape[0] == 1:
+        return group.normalize(poses).expand(count, -1).clone()
+    times = t.to(torch.float64)
+    before = (torch.searchsorted(times, peaks) - 1).clamp(0, len(times) - 2)
+    s = ((peaks - times[before]) / (times[before + 1] - times[before])).clamp(0.0, 1.0)
+    poses = consistent_signs(poses, group)
+    guess = group.interpolate(poses[before], poses[before + 1], s.to(poses.dtype))
+    return consistent_signs(guess, group)
