@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any, Protocol
 
 import torch
@@ -127,8 +128,35 @@ def close_matrices(name: str, x: Tensor, valid: Tensor, tolerance: float) -> Non
     )
 
 
+def point(name: str, x: Tensor, group: "HasPoints", meaning: str) -> None:
+    """Points `(..., P)` of `group`, finite, with usable quaternions."""
+    is_floating_tensor(name, x)
+    has_last(name, x, group.point_size, meaning)
+    finite(name, x)
+    quaternions(name, x, group.arithmetic.sign_blocks)
+
+
+def instance(name: str, x: object, kind: type, meaning: str) -> None:
+    """`x` is a `kind`."""
+    if not isinstance(x, kind):
+        raise TypeError(f"{name}: expected {meaning}, got {type(x).__name__}")
+
+
+def number(name: str, x: float) -> None:
+    """A real number of Python or NumPy; neither a truth value nor a tensor."""
+    if isinstance(x, bool) or not isinstance(x, Real):
+        raise TypeError(f"{name}: expected a number, got {type(x).__name__}")
+
+
+def whole(name: str, x: int, least: int) -> None:
+    """An int of at least `least`."""
+    if isinstance(x, bool) or not isinstance(x, (int, torch.SymInt)) or x < least:
+        raise ValueError(f"{name}: expected a whole number of at least {least}, got {x!r}")
+
+
 def positive(name: str, x: float) -> float:
     """A finite number above zero."""
+    number(name, x)
     if not (math.isfinite(x) and x > 0):
         raise ValueError(f"{name}: expected a finite number above zero, got {x}")
     return x
@@ -136,6 +164,7 @@ def positive(name: str, x: float) -> float:
 
 def finite_number(name: str, x: float) -> float:
     """A finite number."""
+    number(name, x)
     if not math.isfinite(x):
         raise ValueError(f"{name}: expected a finite number, got {x}")
     return x

@@ -3,7 +3,7 @@
 from torchspline.arithmetic import series, so3
 from torchspline.arithmetic.group import AdjointSeriesGroup, Matrix
 from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, add, cross, dot, is_zero, negate, scale, zero
+from torchspline.arithmetic.vector import Vector, add, cross, dot, is_zero, negate, zero
 
 _ROTATION = so3.SO3()
 

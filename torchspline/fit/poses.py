@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -91,13 +91,28 @@ def fit_poses(
         TypeError, ValueError: a wrong type, shape or value; fewer than two distinct usable times.
     """
     group = _group(representation)
-    _check(t, poses, dt, order, position_sigma, rotation_sigma, smoothness)
+    _check(t, poses)
+    checks.whole("order", order, least=2)
+    checks.whole("max_iterations", max_iterations, least=0)
+    for name, x in (
+        ("dt", dt),
+        ("position_sigma", position_sigma),
+        ("rotation_sigma", rotation_sigma),
+        ("smoothness", smoothness),
+    ):
+        checks.positive(name, x)
+    if checks.finite_number("tolerance", tolerance) < 0:
+        raise ValueError(f"tolerance: expected a number that is not negative, got {tolerance}")
     usable = ~poses.isnan().any(dim=-1)
     if t.dtype != torch.int64:
         usable &= ~t.isnan()
-        checks.finite("t", t[usable])
-    checks.finite("poses", poses[usable])
-    checks.quaternions("poses", poses[usable], SE3.arithmetic.sign_blocks)
+        checks.finite("t", t.masked_fill(~usable, 0.0))
+    # Rows that are left out anyway must not shift the index that an error gives.
+    filled = torch.where(
+        usable[:, None], poses.detach(), SE3.identity(dtype=poses.dtype, device=poses.device)
+    )
+    checks.finite("poses", filled)
+    checks.quaternions("poses", filled, SE3.arithmetic.sign_blocks)
     order_of_time = torch.argsort(t, stable=True)
     rows = order_of_time[usable[order_of_time]]
     times, measured = t.detach()[rows].cpu(), poses.detach()[rows].to("cpu", torch.float64)
@@ -123,7 +138,7 @@ def fit_poses(
     gaps = knots.gaps(times)
     dropped, duplicates = int((~usable).sum()), len(times) - distinct
     notes = _notes(order_of_time, dropped, duplicates, gaps, len(times), knots)
-    return PoseFit(trajectory, *residual, dropped, duplicates, gaps, cost, reason, notes)
+    return PoseFit(trajectory, residual[0], residual[1], dropped, duplicates, gaps, cost, reason, notes)
 
 
 def _group(representation: str) -> Group:
@@ -131,15 +146,7 @@ def _group(representation: str) -> Group:
     return product(R3, SO3) if representation == "split" else SE3
 
 
-def _check(
-    t: Tensor,
-    poses: Tensor,
-    dt: float,
-    order: int,
-    position_sigma: float,
-    rotation_sigma: float,
-    smoothness: float,
-) -> None:
+def _check(t: Tensor, poses: Tensor) -> None:
     checks.is_floating_tensor("poses", poses)
     if not isinstance(t, Tensor):
         raise TypeError(
@@ -155,10 +162,6 @@ def _check(
         raise ValueError(
             f"t: on device {t.device}, but poses are on {poses.device}; move one with .to(device)"
         )
-    blending_matrix(order)
-    for name, x in (("dt", dt), ("position_sigma", position_sigma), ("rotation_sigma", rotation_sigma)):
-        checks.positive(name, x)
-    checks.positive("smoothness", smoothness)
 
 
 class _Knots:
@@ -168,20 +171,20 @@ class _Knots:
         self.order = order
         self.nanoseconds = times.dtype == torch.int64
         self.t0 = times[0].item()
-        self.dt: float | int = round(dt * _NANOSECONDS) if self.nanoseconds else dt
+        self.dt: float | int = round(dt * _NANOSECONDS) if self.nanoseconds else float(dt)
         if self.dt == 0:
-            raise ValueError(f"dt: {dt} s is below a nanosecond")
+            raise ValueError(f"dt: with int64 times expected at least a nanosecond, got {dt} s")
         span = times[-1].item() - self.t0
         segments = -(-span // self.dt) if self.nanoseconds else math.ceil(span / self.dt - 1e-9)
         self.segments = max(int(segments), 1)
         self.count = self.segments + order - 1
 
-    def options(self) -> dict:
+    def options(self) -> dict[str, Any]:
         return {"dt_ns": self.dt, "t0_ns": self.t0} if self.nanoseconds else {"dt": self.dt, "t0": self.t0}
 
     def place(self, times: Tensor) -> tuple[np.ndarray, np.ndarray]:
         located = locate(times, self.t0, self.dt, self.segments, "error", True)
-        return located.index.numpy(), located.u.numpy()
+        return located.segment.numpy(), located.u.numpy()
 
     def gaps(self, times: Tensor) -> list[tuple[float, float]]:
         """Stretches between neighbouring poses in which at least one whole knot interval has no pose."""
@@ -233,8 +236,7 @@ class _Problem:
             self.times,
             group=self.group,
             order=self.knots.order,
-            **({"dt_ns": self.knots.dt, "t0_ns": self.knots.t0} if self.knots.nanoseconds else
-               {"dt": self.knots.dt, "t0": self.knots.t0}),
+            **self.knots.options(),
             derivatives=0,
             validate=False,
         ).value  # fmt: skip

@@ -55,6 +55,7 @@ class Group:
         self, *batch: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
     ) -> Tensor:
         """The neutral element, `(*batch, point_size)`."""
+        _new(batch, dtype)
         element = torch.tensor(self.arithmetic.identity(), dtype=dtype, device=device)
         return element.expand(*batch, self.point_size).clone()
 
@@ -66,6 +67,9 @@ class Group:
         device: torch.device | str | None = None,
     ) -> Tensor:
         """Random points `(*batch, point_size)`: rotations uniform, translations standard normal."""
+        _new(batch, dtype)
+        if generator is not None:
+            checks.instance("generator", generator, torch.Generator, "a torch.Generator")
         numbers = torch.randn(*batch, self.point_size, generator=generator, dtype=dtype, device=device)
         return join(self.arithmetic.normalize(split(numbers)), numbers)
 
@@ -82,8 +86,8 @@ class Group:
                 f"matrix: expected shape (..., {size}, {size}) for {self}, got {tuple(matrix.shape)}"
             )
         checks.finite("matrix", matrix)
-        rows = tuple(split(row) for row in matrix.unbind(-2))
-        points = join(self.arithmetic.from_matrix(rows), matrix[..., 0])
+        rows = tuple(split(row.unsqueeze(-2)) for row in matrix.unbind(-2))
+        points = join(self.arithmetic.from_matrix(rows), matrix[..., :1, :]).squeeze(-2)
         back = self.to_matrix(points.detach(), validate=False)
         checks.close_matrices("matrix", matrix, back, 1e-3)
         return points
@@ -130,6 +134,7 @@ class Group:
         """
         self._accept(validate, start=(start, "point"), end=(end, "point"))
         if not isinstance(s, Tensor):
+            checks.number("s", s)
             s = torch.as_tensor(s, dtype=start.dtype, device=start.device)
         checks.is_floating_tensor("s", s)
         checks.same_kind(start=start, s=s)
@@ -156,11 +161,14 @@ class Group:
         return run("compose", self.name, *pair)
 
     # ------------------------------------------------------------------ linear maps
+    # Components get a dimension of their own (`unsqueeze`): with none at all, as inside `vmap`, PyTorch's forward
+    # mode makes float64 of the float32 product of a number and a tensor.
 
     def normalize(self, point: Tensor, *, validate: bool = True) -> Tensor:
         """The unit representative: quaternions are scaled to length one, their sign stays."""
         self._accept(validate, point=(point, "point"))
-        return join(self.arithmetic.normalize(split(point)), point)
+        stored = point.unsqueeze(-2)
+        return join(self.arithmetic.normalize(split(stored)), stored).squeeze(-2)
 
     def adjoint(self, point: Tensor, *, validate: bool = True) -> Tensor:
         """The matrix of Ad_X, [S20] (3): `X Exp(v) = Exp(Ad_X v) X`. `(..., D, D)`."""
@@ -172,8 +180,9 @@ class Group:
         """Ad_X v without forming the matrix."""
         self._accept(validate, point=(point, "point"), tangent=(tangent, "tangent"))
         batch = torch.broadcast_shapes(point.shape[:-1], tangent.shape[:-1])
-        X = self.arithmetic.normalize(split(point))
-        return join(self.arithmetic.adjoint(X, split(tangent)), tangent.expand(*batch, self.tangent_size))
+        v = tangent.expand(*batch, self.tangent_size).unsqueeze(-2)
+        X = self.arithmetic.normalize(split(point.unsqueeze(-2)))
+        return join(self.arithmetic.adjoint(X, split(v)), v).squeeze(-2)
 
     def bracket(self, a: Tensor, b: Tensor, *, validate: bool = True) -> Tensor:
         """The Lie bracket `[a, b] = ad_a b` of tangents; corrects [S20] (6), which should read V W - W V."""
@@ -200,8 +209,9 @@ class Group:
     def to_matrix(self, point: Tensor, *, validate: bool = True) -> Tensor:
         """The matrix: 3x3 for SO3, homogeneous 4x4 for SE3, block diagonal for products."""
         self._accept(validate, point=(point, "point"))
-        rows = self.arithmetic.to_matrix(self.arithmetic.normalize(split(point)))
-        return torch.stack([join(row, point) for row in rows], dim=-2)
+        stored = point.unsqueeze(-2)
+        rows = self.arithmetic.to_matrix(self.arithmetic.normalize(split(stored)))
+        return torch.cat([join(row, stored) for row in rows], dim=-2)
 
     # ------------------------------------------------------------------ helpers
 
@@ -237,6 +247,14 @@ class Group:
                 checks.quaternions(name, x, self.arithmetic.sign_blocks)
 
 
+def _new(batch: tuple[int, ...], dtype: torch.dtype) -> None:
+    """Check what new points shall be like."""
+    for size in batch:
+        checks.whole("batch", size, least=0)
+    if dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
+
+
 SO3 = Group("SO3")
 SE3 = Group("SE3")
 R3 = Group("R3")
@@ -244,8 +262,7 @@ R3 = Group("R3")
 
 def Rn(size: int) -> Group:
     """R^n under addition."""
-    if not isinstance(size, int) or size < 1:
-        raise ValueError(f"size: expected a positive whole number, got {size!r}")
+    checks.whole("size", size, least=1)
     return Group(f"R{size}")
 
 
@@ -253,4 +270,6 @@ def product(*groups: Group) -> Group:
     """The direct product; `product(R3, SO3)` is the split pose."""
     if len(groups) < 2:
         raise ValueError(f"groups: expected at least two, got {len(groups)}")
+    for group in groups:
+        checks.instance("groups", group, Group, "torchspline.Groups such as torchspline.SO3")
     return Group("x".join(group.name for group in groups))

@@ -13,99 +13,102 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.recurrence import forward, reverse, tangent
+from torchspline.arithmetic.recurrence import Step, forward, reverse, tangent
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import Vector, add, negate, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.nested import outer_levels, primals
+
+Arguments = tuple[Vector, ...]
 
 
 class Operation(ABC):
     """One operation on components. Points are stored numbers, quaternions of any length."""
 
     @abstractmethod
-    def forward(self, group: GroupArithmetic, *arguments: Vector) -> Vector:
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         """The result."""
 
     @abstractmethod
-    def reverse(
-        self, group: GroupArithmetic, arguments: tuple[Vector, ...], cotangent: Vector
-    ) -> tuple[Vector, ...]:
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
         """Euclidean gradients of all arguments."""
 
     @abstractmethod
-    def tangent(
-        self, group: GroupArithmetic, arguments: tuple[Vector, ...], rates: tuple[Vector, ...]
-    ) -> Vector:
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         """Rate of the result, given those of the arguments."""
 
 
 class Exp(Operation):
-    def forward(self, group, x):
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        (x,) = arguments
         return group.exp(x)
 
-    def reverse(self, group, arguments, cotangent):
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
         (x,) = arguments
         return (group.right_jacobian_transpose(x, group.pull(group.exp(x), cotangent)),)
 
-    def tangent(self, group, arguments, rates):
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         (x,), (dx,) = arguments, rates
         return group.push(group.exp(x), group.right_jacobian(x, dx))
 
 
 class Log(Operation):
-    def forward(self, group, stored):
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        (stored,) = arguments
         return group.log(group.normalize(stored))
 
-    def reverse(self, group, arguments, cotangent):
-        x = self.forward(group, *arguments)
-        return (group.embed(*arguments, group.right_jacobian_inverse_transpose(x, cotangent, short=True)),)
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
+        x = self.forward(group, arguments)
+        return (group.embed(arguments[0], group.right_jacobian_inverse_transpose(x, cotangent, short=True)),)
 
-    def tangent(self, group, arguments, rates):
-        x = self.forward(group, *arguments)
-        return group.right_jacobian_inverse(x, group.extract(*arguments, *rates), short=True)
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
+        x = self.forward(group, arguments)
+        return group.right_jacobian_inverse(x, group.extract(arguments[0], rates[0]), short=True)
 
 
 class Compose(Operation):
-    def forward(self, group, left, right):
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        left, right = arguments
         return group.compose(group.normalize(left), group.normalize(right))
 
-    def reverse(self, group, arguments, cotangent):
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
         left, right = arguments
-        g = group.pull(self.forward(group, left, right), cotangent)
+        g = group.pull(self.forward(group, arguments), cotangent)
         return group.embed(left, group.coadjoint_inverse(group.normalize(right), g)), group.embed(right, g)
 
-    def tangent(self, group, arguments, rates):
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         left, right = arguments
         moved = group.adjoint_inverse(group.normalize(right), group.extract(left, rates[0]))
-        return group.push(self.forward(group, left, right), add(moved, group.extract(right, rates[1])))
+        return group.push(self.forward(group, arguments), add(moved, group.extract(right, rates[1])))
 
 
 class Inverse(Operation):
-    def forward(self, group, stored):
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        (stored,) = arguments
         return group.inverse(group.normalize(stored))
 
-    def reverse(self, group, arguments, cotangent):
-        inverse = self.forward(group, *arguments)
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
+        inverse = self.forward(group, arguments)
         g = group.coadjoint_inverse(inverse, group.pull(inverse, cotangent))
-        return (group.embed(*arguments, negate(g)),)
+        return (group.embed(arguments[0], negate(g)),)
 
-    def tangent(self, group, arguments, rates):
-        inverse = self.forward(group, *arguments)
-        xi = group.adjoint_inverse(inverse, group.extract(*arguments, *rates))
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
+        inverse = self.forward(group, arguments)
+        xi = group.adjoint_inverse(inverse, group.extract(arguments[0], rates[0]))
         return group.push(inverse, negate(xi))
 
 
 class Act(Operation):
-    def forward(self, group, stored, point):
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        stored, point = arguments
         return group.act(group.normalize(stored), point)
 
-    def reverse(self, group, arguments, cotangent):
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
         stored, point = arguments
         g, point_cotangent = group.act_reverse(group.normalize(stored), point, cotangent)
         return group.embed(stored, g), point_cotangent
 
-    def tangent(self, group, arguments, rates):
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         stored, point = arguments
         xi = group.extract(stored, rates[0])
         return group.act_tangent(group.normalize(stored), point, xi, rates[1])
@@ -114,26 +117,28 @@ class Act(Operation):
 class Interpolate(Operation):
     """The geodesic from `start` (s = 0) to `end` (s = 1): a cumulative product of one step, weight s."""
 
-    def _sweep(self, group, start, end, s):
+    @staticmethod
+    def _sweep(group: GroupArithmetic, arguments: Arguments) -> tuple[Vector, Vector, list[Step]]:
+        start, end, s = arguments
         a, b = group.normalize(start), group.normalize(end)
         d = group.log(group.between(a, b))
         value, trace = forward(group, a, [d], [s], derivatives=0)
         return d, value, trace
 
-    def forward(self, group, start, end, s):
-        return self._sweep(group, start, end, s)[1]
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        return self._sweep(group, arguments)[1]
 
-    def reverse(self, group, arguments, cotangent):
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
         start, end, s = arguments
-        d, value, trace = self._sweep(group, start, end, s)
+        d, value, trace = self._sweep(group, arguments)
         g, (d_g,), (s_g,) = reverse(group, [d], [s], trace, group.pull(value, cotangent), [])
         g = add(g, negate(group.left_jacobian_inverse_transpose(d, d_g, short=True)))
         end_g = group.right_jacobian_inverse_transpose(d, d_g, short=True)
         return group.embed(start, g), group.embed(end, end_g), tuple(s_g)
 
-    def tangent(self, group, arguments, rates):
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         start, end, s = arguments
-        d, value, trace = self._sweep(group, start, end, s)
+        d, value, trace = self._sweep(group, arguments)
         start_rate, end_rate = group.extract(start, rates[0]), group.extract(end, rates[1])
         d_rate = add(
             group.right_jacobian_inverse(d, end_rate, short=True),
@@ -155,7 +160,7 @@ OPERATIONS: dict[str, Operation] = {
 
 
 def _forward(operation: str, group: str, *arguments: Tensor) -> Tensor:
-    components = OPERATIONS[operation].forward(arithmetic(group), *map(split, arguments))
+    components = OPERATIONS[operation].forward(arithmetic(group), tuple(map(split, arguments)))
     return join(components, arguments[0])
 
 
@@ -183,11 +188,11 @@ class GroupFunction(Function):
         ctx.save_for_forward(*arguments)
 
     @staticmethod
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         return None, None, *_reverse(ctx.operation, ctx.group, ctx.saved_tensors, cotangent)
 
     @staticmethod
-    def jvp(ctx: Any, _operation: None, _group: None, *rates: Tensor | None) -> Tensor:  # type: ignore[override]
+    def jvp(ctx: Any, _operation: None, _group: None, *rates: Tensor | None) -> Tensor:
         with outer_levels():
             arguments = primals(ctx.saved_tensors)
             components = tuple(map(split, arguments))

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.groups.group import SO3
-from torchspline.splines.trajectory import Trajectory
+from torchspline.groups.group import SE3, SO3
+from torchspline.splines.trajectory import MECHANICS, Trajectory
 
 #: Standard gravity as an acceleration in a world whose z axis points up, m/s^2.
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
@@ -44,16 +44,15 @@ def measure(
     Raises:
         TypeError, ValueError: a wrong type, shape or value, or a trajectory without rotation or position.
     """
-    if not isinstance(trajectory, Trajectory):
-        raise TypeError(f"trajectory: expected a Trajectory, got {type(trajectory).__name__}")
+    checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
+    if trajectory.group.name not in MECHANICS:
+        raise _no_body(trajectory)
     if T_body_imu is not None:
+        checks.point("T_body_imu", T_body_imu, SE3, "an SE3 pose")
         trajectory = trajectory.mounted(T_body_imu)
     motion = trajectory.kinematics(t)
     if motion.rotation is None or motion.acceleration is None or motion.angular_velocity is None:
-        raise ValueError(
-            f"trajectory: an IMU needs rotation and position, but this one is in {trajectory.group}; "
-            "use SE3 or R3xSO3"
-        )
+        raise _no_body(trajectory)
     world = motion.acceleration - _vector("gravity", gravity, motion.acceleration)
     accelerometer = SO3.act(SO3.inverse(motion.rotation, validate=False), world, validate=False)
     gyroscope = motion.angular_velocity
@@ -64,12 +63,21 @@ def measure(
     return ImuReading(gyroscope, accelerometer)
 
 
+def _no_body(trajectory: Trajectory) -> ValueError:
+    return ValueError(
+        f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
+    )
+
+
 def _vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
     if isinstance(x, Tensor):
         checks.is_floating_tensor(name, x)
         checks.same_kind(trajectory=like, **{name: x})
     else:
-        x = torch.tensor(x, dtype=like.dtype, device=like.device)
+        try:
+            x = torch.tensor(x, dtype=like.dtype, device=like.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"{name}: expected a tensor or three numbers, got {x!r}") from None
     checks.has_last(name, x, 3, "x, y, z")
     checks.finite(name, x)
     checks.broadcast(**{name: x.shape, "readings": like.shape})

@@ -54,8 +54,10 @@ def bspline(
     """
     group = _as_group(group)
     _check_control_points(control_points, group, order, validate)
-    if not isinstance(derivatives, int) or not 0 <= derivatives <= MAX_DERIVATIVES:
-        raise ValueError(f"derivatives: expected 0 to {MAX_DERIVATIVES}, got {derivatives!r}")
+    if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
+        raise ValueError(
+            f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
+        )
     checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
     start, spacing, seconds = _knots(t, dt, t0, dt_ns, t0_ns)
     _check_times(t, control_points, validate)
@@ -66,7 +68,7 @@ def bspline(
     # Extrapolating linearly needs the velocity even where only the value is asked for.
     needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
     u = place.u.to(control_points.dtype)
-    fields = cumulative_bspline(control_points, u, place.index, group.name, order, needed)
+    fields = cumulative_bspline(control_points, u, place.segment, group.name, order, needed)
     if place.beyond is not None:
         fields = _beyond(group, fields, place, extrapolate)
     fields = fields[: derivatives + 1]
@@ -75,17 +77,13 @@ def bspline(
 
 
 def _as_group(group: Group) -> Group:
-    if not isinstance(group, Group):
-        raise TypeError(
-            f"group: expected a torchspline.Group such as torchspline.SE3, got {type(group).__name__}"
-        )
+    checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
     return group
 
 
 def _check_control_points(control_points: Tensor, group: Group, order: int, validate: bool) -> None:
     checks.is_floating_tensor("control_points", control_points)
-    if isinstance(order, bool) or not isinstance(order, int) or order < 2:
-        raise ValueError(f"order: expected a whole number of at least 2, got {order!r}")
+    checks.whole("order", order, least=2)
     if control_points.ndim < 2 or control_points.shape[-1] != group.point_size:
         raise ValueError(
             f"control_points: expected shape (..., M, {group.point_size}), M points of {group}, "
@@ -108,7 +106,12 @@ def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, An
         )
     if dt_ns is not None or t0_ns is not None:
         if dt is not None or dt_ns is None:
-            raise ValueError("dt_ns, t0_ns: nanoseconds are used as a whole: give dt_ns and t0_ns, and no dt")
+            raise ValueError(
+                "dt_ns, t0_ns: nanoseconds are used as a whole: expected dt_ns and no dt, "
+                f"got dt_ns={dt_ns} and dt={dt}"
+            )
+        if isinstance(t0, Tensor) or t0 != 0:
+            raise ValueError(f"t0: with dt_ns the start is expected as t0_ns, got t0={t0}")
         for name, x in (("dt_ns", dt_ns), ("t0_ns", 0 if t0_ns is None else t0_ns)):
             if isinstance(x, bool) or not isinstance(x, int):
                 raise TypeError(f"{name}: expected a whole number of nanoseconds, got {x!r}")
@@ -117,7 +120,7 @@ def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, An
         checks.positive("dt_ns", dt_ns)
         return t0_ns or 0, dt_ns, dt_ns * _NANOSECOND
     if dt is None:
-        raise ValueError("dt: the knot spacing is missing; give dt in seconds, or dt_ns and t0_ns")
+        raise ValueError("dt: expected the knot spacing, dt in seconds or dt_ns and t0_ns, got neither")
     if t.dtype == torch.int64:
         raise TypeError("t: int64 times are nanoseconds and go with dt_ns and t0_ns; got dt in seconds")
     checks.is_floating_tensor("t", t)
@@ -283,7 +286,7 @@ class BSpline(Trajectory):
             dt_ns=self.dt_ns,
             t0_ns=self.t0_ns,
             derivatives=derivatives,
-            extrapolate=self.extrapolate,  # type: ignore[arg-type]
+            extrapolate=self.extrapolate,
             validate=self.validate,
         )
 

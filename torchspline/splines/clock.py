@@ -15,7 +15,7 @@ class Located(NamedTuple):
     """Where times fall, each of the shape of the times."""
 
     #: Segment, int64, and place within it in [0, 1] (float64).
-    index: Tensor
+    segment: Tensor
     u: Tensor
     #: How far before the start (negative) or past the end a time lies, in knot spacings; None if none may.
     beyond: Tensor | None
@@ -40,31 +40,30 @@ def locate(
     """
     if t.dtype == torch.int64:
         elapsed = t - t0
-        index = elapsed.div(dt, rounding_mode="floor").clamp(0, segments - 1)
-        within = (elapsed - index * dt).to(torch.float64)
+        segment = torch.div(elapsed, dt, rounding_mode="floor").clamp(0, segments - 1)
+        within = (elapsed - segment * dt).to(torch.float64)
         u = within / (dt.to(torch.float64) if isinstance(dt, Tensor) else float(dt))
-        tolerance = 0.0
+        tolerance: Tensor | float = 0.0
     else:
         if validate:
             _check_float32(t, dt)
         s = (t.to(torch.float64) - t0) / dt
-        index = s.detach().floor().clamp(0, segments - 1).nan_to_num().to(torch.int64)
-        u = s - index
+        segment = s.detach().floor().clamp(0, segments - 1).nan_to_num().to(torch.int64)
+        u = s - segment
         tolerance = _tolerance(t, t0, dt, segments)
     if extrapolate != "error":
         inside = u.clamp(0.0, 1.0)
-        return Located(index, inside, u - inside)
+        return Located(segment, inside, u - inside)
     if validate:
         outside = (u.detach() < -tolerance) | (u.detach() > 1.0 + tolerance) | u.detach().isnan()
         if _none_outside(t, t0, dt, segments, outside) is None:
             u = torch.where(outside, torch.nan, u)
-    return Located(index, u, None)
+    return Located(segment, u, None)
 
 
 def _tolerance(t: Tensor, t0: Tensor | float, dt: Tensor | float, segments: int) -> Tensor | float:
     """A few rounding errors of the times, in knot spacings."""
-    largest = t.detach().abs().to(torch.float64).clamp_min(1e-300) + abs(_detach(t0))
-    largest = largest + segments * abs(_detach(dt))
+    largest = t.detach().abs().to(torch.float64) + _detach(t0).__abs__() + segments * _detach(dt)
     return (4.0 * torch.finfo(t.dtype).eps * largest / _detach(dt)).clamp_max(1e-2)
 
 
@@ -79,9 +78,9 @@ def _check_float32(t: Tensor, dt: Tensor | float) -> None:
     rounding = torch.finfo(torch.float32).eps * t.detach().abs().amax()
     if checks.seen_true(rounding.to(torch.float64) > 1e-3 * _detach(dt)):
         raise ValueError(
-            f"t: float32 rounds times near {t.detach().abs().amax().item():.6g} s to {rounding.item():.1e} s, more than "
-            f"a thousandth of dt = {float(dt):g} s; pass float64 times, int64 nanoseconds, or times relative to a "
-            "nearer origin"
+            f"t: float32 rounds times near {t.detach().abs().amax().item():.6g} s to {rounding.item():.1e} s, "
+            f"more than a thousandth of dt = {float(dt):g} s; pass float64 times, int64 nanoseconds, or times "
+            "relative to a nearer origin"
         )
 
 
@@ -99,6 +98,6 @@ def _none_outside(
     end = _detach(t0) + segments * _detach(dt)
     start, stop = (x.item() if isinstance(x, Tensor) else x for x in (_detach(t0), end))
     raise ValueError(
-        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] {unit}, the first "
-        f"is {first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
+        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] {unit}, "
+        f"the first is {first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
     )

@@ -228,17 +228,21 @@ class CumulativeBSpline(Function):
         ctx.set_materialize_grads(False)
 
     @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         if all(c is None for c in cotangents):
             return (None,) * 6
-        gradients = _reverse(*ctx.saved_tensors, ctx.group, ctx.order, cotangents, ctx.needs_input_grad[1])
+        control_points, u, index = ctx.saved_tensors
+        u_needed = ctx.needs_input_grad[1]
+        gradients = _reverse(control_points, u, index, ctx.group, ctx.order, cotangents, u_needed)
         return *gradients, None, None, None, None
 
     @staticmethod
-    def jvp(ctx: Any, control_rate: Tensor | None, u_rate: Tensor | None, *_: None) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def jvp(ctx: Any, control_rate: Tensor | None, u_rate: Tensor | None, *_: None) -> tuple[Tensor, ...]:
         with outer_levels():
-            saved = primals(ctx.saved_tensors)
-            return _tangent(*saved, ctx.group, ctx.order, ctx.derivatives, control_rate, u_rate)
+            control_points, u, index = primals(ctx.saved_tensors)
+            return _tangent(
+                control_points, u, index, ctx.group, ctx.order, ctx.derivatives, control_rate, u_rate
+            )
 
 
 @torch.library.custom_op("torchspline::bspline", mutates_args=())

@@ -1,0 +1,23 @@
+"""The code in the README runs as it stands."""
+
+import re
+from pathlib import Path
+
+import torch
+
+README = Path(__file__).resolve().parent.parent / "README.md"
+
+
+def test_readme_code_runs() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    torch.manual_seed(0)
+    names: dict = {}
+    exec(code, names)
+    assert names["gyroscope"].shape == (100, 3)
+    assert torch.isfinite(names["loss"])
+
+
+def test_readme_names_the_two_commands() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert "pip install -c constraints.txt . && torchspline demo" in text
+    assert "pip install -c constraints.txt -e '.[test]' && pytest" in text

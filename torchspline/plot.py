@@ -1,0 +1,65 @@
+"""Figures. Matplotlib is imported when one is drawn, and draws without a screen."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.imu import ImuReading
+
+_AXES = ("x", "y", "z")
+
+
+def imu_comparison(
+    path: str | Path,
+    lines: tuple[Tensor, ImuReading],
+    dots: tuple[Tensor, ImuReading] | None = None,
+    title: str = "",
+    labels: Sequence[str] = ("synthesised", "recorded"),
+) -> None:
+    """Recorded inertial readings as dots under synthesised lines, as in [S20] Figure 1; written to `path`.
+
+    Args:
+        lines, dots: times (N,) in s and readings (N, 3) in rad/s and m/s^2.
+        labels: what the lines and the dots are.
+    """
+    for name, pair in (("lines", lines), ("dots", dots)):
+        if pair is not None:
+            checks.has_last(f"{name}: gyroscope", pair[1].gyroscope, 3, "x, y, z")
+            checks.has_last(f"{name}: accelerometer", pair[1].accelerometer, 3, "x, y, z")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, sensor, label in (
+        (panels[0], "accelerometer", "specific force [m/s²]"),
+        (panels[1], "gyroscope", "angular velocity [rad/s]"),
+    ):
+        for i, name in enumerate(_AXES):
+            color = f"C{i}"
+            if dots is not None:
+                axes.plot(
+                    _numbers(dots[0]), _numbers(getattr(dots[1], sensor)[:, i]), ".", color=color, markersize=5,
+                    alpha=0.5, markeredgewidth=0, label=f"{name} {labels[1]}",
+                )  # fmt: skip
+            axes.plot(
+                _numbers(lines[0]), _numbers(getattr(lines[1], sensor)[:, i]), color=color, linewidth=1.2,
+                label=f"{name} {labels[0]}",
+            )  # fmt: skip
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+    panels[1].set_xlabel("time [s]")
+    panels[0].set_title(title)
+    panels[0].legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=6, fontsize=8, frameon=False, markerscale=2
+    )
+    figure.savefig(path, dpi=130)
+
+
+def _numbers(x: Tensor):
+    return x.detach().to("cpu", torch.float64).numpy()
