@@ -1,10 +1,16 @@
-"""What every test may use: the folder of real recordings, and one torch thread per parallel worker."""
+"""What every test may use: the folder of real recordings, and one torch thread per parallel worker.
+
+Tests run the reference implementation unless they ask for kernels (`torchspline.use_kernels`), since
+compiling a kernel for every group, order and precision they touch would take most of their time.
+"""
 
 import os
 from pathlib import Path
 
 import pytest
 import torch
+
+os.environ.setdefault("TORCHSPLINE_KERNELS", "reference")
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)

@@ -3,6 +3,7 @@
 from torchspline import functional, imu
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
+from torchspline.kernels.mode import use_kernels
 from torchspline.splines import (
     BSpline,
     Kinematics,
@@ -36,4 +37,5 @@ __all__ = [
     "initial_control_points",
     "phantom_points",
     "product",
+    "use_kernels",
 ]

@@ -8,7 +8,9 @@ from torch import Tensor, nn
 from torchspline import checks
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import R3, SO3, Group, product
-from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, locate
+from torchspline.kernels.mode import usable
+from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, check_float32, locate
+from torchspline.splines.fused import fused_bspline, kernels_of
 from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
 
@@ -59,21 +61,34 @@ def bspline(
             f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
         )
     checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
-    start, spacing, seconds = _knots(t, dt, t0, dt_ns, t0_ns)
+    start, spacing = _knots(t, dt, t0, dt_ns, t0_ns)
     _check_times(t, control_points, validate)
 
     segments = control_points.shape[-2] - order + 1
     control_points, times, shape = _align(control_points, t)
-    place = locate(times, start, spacing, segments, extrapolate, validate)
-    # Extrapolating linearly needs the velocity even where only the value is asked for.
-    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
-    u = place.u.to(control_points.dtype)
-    fields = cumulative_bspline(control_points, u, place.segment, group.name, order, needed)
-    if place.beyond is not None:
-        fields = _beyond(group, fields, place, extrapolate)
-    fields = fields[: derivatives + 1]
-    scaled = [field if r == 0 else field / seconds**r for r, field in enumerate(fields)]
-    return State(*(field.reshape(*shape, field.shape[-1]) for field in scaled))
+
+    def reference(control_points: Tensor, times: Tensor, start: Any, spacing: Any) -> tuple[Tensor, ...]:
+        place = locate(times, start, spacing, segments, extrapolate, validate)
+        # Extrapolating linearly needs the velocity even where only the value is asked for.
+        needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
+        u = place.u.to(control_points.dtype)
+        fields = cumulative_bspline(control_points, u, place.segment, group.name, order, needed)
+        if place.beyond is not None:
+            fields = _beyond(group, fields, place, extrapolate)
+        seconds = spacing * _NANOSECOND if times.dtype == torch.int64 else spacing
+        return tuple(
+            field if r == 0 else field / seconds**r for r, field in enumerate(fields[: derivatives + 1])
+        )
+
+    fields = None
+    if extrapolate == "error" and usable(control_points, times, start, spacing):
+        kernels = kernels_of(group.name, order, derivatives, control_points, times)
+        if validate:
+            check_float32(times, spacing)
+        fields = fused_bspline(control_points, times, start, spacing, kernels, segments, validate, reference)
+    if fields is None:  # no kernel, or a time outside, which the reference explains
+        fields = reference(control_points, times, start, spacing)
+    return State(*(field.reshape(*shape, field.shape[-1]) for field in fields))
 
 
 def _as_group(group: Group) -> Group:
@@ -98,8 +113,8 @@ def _check_control_points(control_points: Tensor, group: Group, order: int, vali
         checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
 
 
-def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any, Any]:
-    """Start and spacing in the unit of the times, and the spacing in seconds."""
+def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any]:
+    """Start and spacing in the unit of the times."""
     if not isinstance(t, Tensor):
         raise TypeError(
             f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
@@ -118,13 +133,13 @@ def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, An
         if t.dtype != torch.int64:
             raise TypeError(f"t: with dt_ns, times are int64 nanoseconds, got {t.dtype}")
         checks.positive("dt_ns", dt_ns)
-        return t0_ns or 0, dt_ns, dt_ns * _NANOSECOND
+        return t0_ns or 0, dt_ns
     if dt is None:
         raise ValueError("dt: expected the knot spacing, dt in seconds or dt_ns and t0_ns, got neither")
     if t.dtype == torch.int64:
         raise TypeError("t: int64 times are nanoseconds and go with dt_ns and t0_ns; got dt in seconds")
     checks.is_floating_tensor("t", t)
-    return _seconds("t0", t0, t), _seconds("dt", dt, t, positive=True), dt
+    return _seconds("t0", t0, t), _seconds("dt", dt, t, positive=True)
 
 
 def _seconds(name: str, x: Any, t: Tensor, positive: bool = False) -> Any:
@@ -194,7 +209,8 @@ class BSpline(Trajectory):
 
     Args:
         control_points: `(*batch, M, P)`. A tensor that requires grad (a network's output, the caller's own leaf) is
-            used as given; any other becomes a `Parameter`, or a buffer if not `learnable`.
+            used as given, and so is a `Parameter`; any other is copied into a `Parameter`, or a buffer if not
+            `learnable`.
         group, order, extrapolate, validate: as in `bspline`.
         dt, t0: seconds, kept in float64 through `.to(dtype)`; tensors that require grad are used as given.
         dt_ns, t0_ns: whole nanoseconds instead; times are then int64.
@@ -221,10 +237,12 @@ class BSpline(Trajectory):
         checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
         self.order, self.extrapolate, self.validate = order, extrapolate, validate
         self.control_points: Tensor
-        if control_points.requires_grad or not learnable:
-            self.register_tensor("control_points", control_points)
-        else:
-            self.control_points = nn.Parameter(control_points)
+        if not control_points.requires_grad and not isinstance(control_points, nn.Parameter):
+            # A copy: an optimiser's step must not reach the caller's numbers, which may be an expanded view, too.
+            control_points = control_points.clone(memory_format=torch.contiguous_format)
+            if learnable:
+                control_points = nn.Parameter(control_points)
+        self.register_tensor("control_points", control_points)
         nanoseconds = dt_ns is not None or t0_ns is not None
         probe = torch.zeros(
             (), dtype=torch.int64 if nanoseconds else torch.float64, device=control_points.device
@@ -235,31 +253,27 @@ class BSpline(Trajectory):
         self.t0: Tensor | None = None
         if not nanoseconds:
             for name, x in (("dt", dt), ("t0", t0)):
-                if not isinstance(x, Tensor) or not x.requires_grad:
-                    x = torch.as_tensor(x, dtype=torch.float64, device=control_points.device)
+                if not isinstance(x, nn.Parameter) and not (isinstance(x, Tensor) and x.requires_grad):
+                    x = torch.as_tensor(x, dtype=torch.float64, device=control_points.device).clone()
                 self.register_tensor(name, x)
-
-    def register_tensor(self, name: str, x: Tensor) -> None:
-        """Keep `x` under `name`: a `Parameter` as one, anything else as a buffer, which may carry a graph."""
-        self.__dict__.pop(name, None)
-        if isinstance(x, nn.Parameter):
-            self.register_parameter(name, x)
-        else:
-            self.register_buffer(name, x)
 
     def _apply(self, fn: Any, recurse: bool = True) -> "BSpline":
         """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
-        kept = {name: getattr(self, name) for name in ("dt", "t0") if getattr(self, name, None) is not None}
+        times: dict[str, Tensor] = {n: x for n in ("dt", "t0") if (x := getattr(self, n)) is not None}
+        # A Parameter is converted in place: only other tensors on the same memory still have its numbers then.
+        numbers = {name: x.detach() for name, x in times.items()}
+        learnt = {name: x for name, x in times.items() if isinstance(x, nn.Parameter)}
+        grads = {name: x.grad.detach() for name, x in learnt.items() if x.grad is not None}
         super()._apply(fn, recurse)
-        for name, old in kept.items():
+        for name, before in times.items():
             new = getattr(self, name)
-            if new.dtype == old.dtype:
+            if new.dtype == numbers[name].dtype:
                 continue
-            restored = old.to(new.device)
             if isinstance(new, nn.Parameter):
-                new.data = restored.detach()
+                new.data = numbers[name].to(new.device)
+                new.grad = grads[name].to(new.device) if name in grads else None
             else:
-                setattr(self, name, restored)
+                setattr(self, name, before.to(new.device))
         return self
 
     @property

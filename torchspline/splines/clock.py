@@ -1,6 +1,6 @@
 """From times to segments of uniform knots: all time arithmetic of the library, in float64 or whole nanoseconds."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,7 +35,7 @@ def locate(
         t: seconds (float) with `t0`, `dt` in seconds, or whole nanoseconds (int64) with both in nanoseconds.
         segments: the domain is `[t0, t0 + segments dt]`; a few rounding errors beyond belong to it.
     Raises:
-        ValueError: see `_check_domain` and `_check_float32`. Where values cannot be seen (other devices, `vmap`,
+        ValueError: see `_none_outside` and `check_float32`. Where values cannot be seen (other devices, `vmap`,
             compilation) times outside give NaN instead.
     """
     if t.dtype == torch.int64:
@@ -43,35 +43,37 @@ def locate(
         segment = torch.div(elapsed, dt, rounding_mode="floor").clamp(0, segments - 1)
         within = (elapsed - segment * dt).to(torch.float64)
         u = within / (dt.to(torch.float64) if isinstance(dt, Tensor) else float(dt))
-        tolerance: Tensor | float = 0.0
     else:
         if validate:
-            _check_float32(t, dt)
+            check_float32(t, dt)
         s = (t.to(torch.float64) - t0) / dt
         segment = s.detach().floor().clamp(0, segments - 1).nan_to_num().to(torch.int64)
         u = s - segment
-        tolerance = _tolerance(t, t0, dt, segments)
     if extrapolate != "error":
         inside = u.clamp(0.0, 1.0)
         return Located(segment, inside, u - inside)
     if validate:
-        outside = (u.detach() < -tolerance) | (u.detach() > 1.0 + tolerance) | u.detach().isnan()
+        slack = tolerance(t, t0, dt, segments)
+        outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
         if _none_outside(t, t0, dt, segments, outside) is None:
             u = torch.where(outside, torch.nan, u)
     return Located(segment, u, None)
 
 
-def _tolerance(t: Tensor, t0: Tensor | float, dt: Tensor | float, segments: int) -> Tensor | float:
-    """A few rounding errors of the times, in knot spacings."""
-    largest = t.detach().abs().to(torch.float64) + _detach(t0).__abs__() + segments * _detach(dt)
-    return (4.0 * torch.finfo(t.dtype).eps * largest / _detach(dt)).clamp_max(1e-2)
+def tolerance(t: Tensor, t0: Tensor | float | int, dt: Tensor | float | int, segments: int) -> Tensor | float:
+    """A few rounding errors of times inside the domain, in knot spacings; nanoseconds are exact."""
+    if t.dtype == torch.int64:
+        return 0.0
+    start, spacing = _detach(t0), _detach(dt)
+    share = 8.0 * torch.finfo(t.dtype).eps * (abs(start) / spacing + segments)
+    return share.clamp_max(1e-2) if isinstance(share, Tensor) else min(share, 1e-2)
 
 
-def _detach(x: Tensor | float) -> Tensor | float:
+def _detach(x: Tensor | float) -> Any:
     return x.detach() if isinstance(x, Tensor) else x
 
 
-def _check_float32(t: Tensor, dt: Tensor | float) -> None:
+def check_float32(t: Tensor, dt: Tensor | float) -> None:
     """float32 seconds are welcome while their rounding is far below the knot spacing."""
     if t.dtype != torch.float32 or t.numel() == 0 or not checks.values_visible(t):
         return

@@ -61,14 +61,17 @@ def _phantoms(near: Tensor, group: Group, order: int, at_end: bool) -> Tensor:
     """
     pad = near.shape[-2] - 1
     corner = near[..., -1:, :] if at_end else near[..., :1, :]
-    if order == 3:
-        # The domain begins and ends halfway between phantom point and keyframe: they have to coincide.
-        return corner
     others = near[..., :-1, :] if at_end else near[..., 1:, :]
     mirrored = group.compose(corner, group.inverse(group.between(corner, others))).flip(-2)
+    if order % 2 == 1:
+        # The domain begins and ends halfway between a phantom point and the keyframe: what is mirrored there is the
+        # keyframe itself first.
+        mirrored = torch.cat(
+            [corner, mirrored[..., :-1, :]] if at_end else [mirrored[..., 1:, :], corner], dim=-2
+        )
+    if order <= 4:
+        return mirrored  # one point twice, or three points on one geodesic: already exact
     points = torch.cat([near, mirrored] if at_end else [mirrored, near], dim=-2)
-    if order == 4:
-        return mirrored  # three points on one geodesic: already exact
     if points.shape[-2] < order:  # an even order: the far control point has no weight at the end
         far = points[..., :1, :] if at_end else points[..., -1:, :]
         points = torch.cat([far, points] if at_end else [points, far], dim=-2)

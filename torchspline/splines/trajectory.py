@@ -91,6 +91,14 @@ class Trajectory(nn.Module, ABC):
     def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
         """Value and time derivatives (0 to 3 of them) at the times `t`."""
 
+    def register_tensor(self, name: str, x: Tensor) -> None:
+        """Keep `x` under `name`: a `Parameter` as one, anything else as a buffer, which may carry a graph."""
+        self.__dict__.pop(name, None)
+        if isinstance(x, nn.Parameter):
+            self.register_parameter(name, x)
+        else:
+            self.register_buffer(name, x)
+
     def forward(self, t: Tensor) -> Tensor:
         """Values at the times `t`, `(*batch, N, P)`."""
         return self.evaluate(t, derivatives=0).value
@@ -138,8 +146,8 @@ class Mounted(Trajectory):
         checks.quaternions("T_body_sensor", T_body_sensor, ((3, 7),))
         self.trajectory = trajectory
         self.group = trajectory.group
-        self.register_buffer("T_body_sensor", T_body_sensor)
         self.T_body_sensor: Tensor
+        self.register_tensor("T_body_sensor", T_body_sensor)
 
     @property
     def domain(self) -> tuple[float, float] | tuple[int, int]:
@@ -150,8 +158,8 @@ class Mounted(Trajectory):
         state = self.trajectory.evaluate(t, derivatives)
         T = self.T_body_sensor
         checks.same_kind(trajectory=state.value, T_body_sensor=T)
-        if state.value.ndim > T.ndim:  # the times come between the batch and the components
-            T = T.unsqueeze(-2) if T.ndim > 1 else T
+        if T.ndim > 1 and t.ndim > 0:  # the times come between the batch and the components
+            T = T.unsqueeze(-2)
         return _ATTACH[self.group.name](state, T)
 
 
@@ -169,21 +177,24 @@ def _attach_so3(s: State, T: Tensor) -> State:
     return State(SO3.compose(s.value, q, validate=False), *rates)
 
 
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b))
+
+
 def _attach_split(s: State, T: Tensor) -> State:
     """Rigid-body transport of position rates over the lever arm; rotations as in SO3."""
     rotation = _attach_so3(State(*(None if x is None else x[..., 3:] for x in s)), T)  # type: ignore[arg-type]
-    q, arm = s.value[..., 3:], T[..., :3].expand(*s.value.shape[:-1], 3)
-    cross = torch.linalg.cross
+    q, arm = s.value[..., 3:], T[..., :3].expand(*rotation.value.shape[:-1], 3)
     offsets = [arm]
     if s.velocity is not None:
         w = s.velocity[..., 3:]
-        offsets.append(cross(w, arm))
+        offsets.append(_cross(w, arm))
     if s.acceleration is not None:
         a = s.acceleration[..., 3:]
-        offsets.append(cross(a, arm) + cross(w, offsets[1]))
+        offsets.append(_cross(a, arm) + _cross(w, offsets[1]))
     if s.jerk is not None:
-        body_rate = cross(s.jerk[..., 3:], arm) + cross(a, offsets[1]) + cross(w, cross(a, arm))
-        offsets.append(cross(w, offsets[2]) + body_rate)
+        body_rate = _cross(s.jerk[..., 3:], arm) + _cross(a, offsets[1]) + _cross(w, _cross(a, arm))
+        offsets.append(_cross(w, offsets[2]) + body_rate)
     joined = [
         torch.cat([x[..., :3] + SO3.act(q, offset, validate=False), r], dim=-1)
         for x, offset, r in zip(s, offsets, rotation, strict=False)

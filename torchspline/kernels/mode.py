@@ -1,0 +1,64 @@
+"""Which implementation runs: compiled kernels or the reference made of tensor operations."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchspline import checks
+from torchspline.kernels.build import available
+
+Mode = Literal["auto", "fused", "reference"]
+MODES: tuple[str, ...] = ("auto", "fused", "reference")
+#: Environment variable with the mode of a process.
+VARIABLE = "TORCHSPLINE_KERNELS"
+
+_mode: ContextVar[str | None] = ContextVar("torchspline_kernels", default=None)
+
+
+@contextmanager
+def use_kernels(mode: Mode) -> Iterator[None]:
+    """Within the block use compiled kernels where they can ("auto"), must ("fused"), or may not ("reference") run.
+
+    The results are the same up to rounding. "fused" raises `RuntimeError` for calls that no kernel can serve.
+    """
+    checks.choice("mode", mode, MODES)
+    token = _mode.set(mode)
+    try:
+        yield
+    finally:
+        _mode.reset(token)
+
+
+def current() -> str:
+    mode = _mode.get() or os.environ.get(VARIABLE, "auto")
+    return checks.choice(VARIABLE, mode, MODES)
+
+
+def usable(*tensors: object) -> bool:
+    """Whether a kernel may serve a call with these tensors (numbers are welcome): eager, on the CPU, untransformed."""
+    mode = current()
+    if mode == "reference":
+        return False
+    plain = (
+        all(x.device.type == "cpu" for x in tensors if isinstance(x, Tensor))
+        and not torch.compiler.is_compiling()
+        and not transformed()
+        and available()
+    )
+    if mode == "fused" and not plain:
+        raise RuntimeError(
+            f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors on the CPU outside "
+            "torch.func transforms and forward-mode differentiation, and Numba"
+        )
+    return plain
+
+
+def transformed() -> bool:
+    """Whether `torch.func` or forward mode is at work: those need operations they can see."""
+    return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0

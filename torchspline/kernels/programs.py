@@ -1,0 +1,107 @@
+"""What is compiled: the library's arithmetic, written out as flat functions of numbers."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+
+import torch
+
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.recurrence import forward, reverse
+from torchspline.arithmetic.scalar import Scalar
+from torchspline.arithmetic.vector import Vector, negate, plus, scale, times
+from torchspline.kernels.trace import Trace, trace
+
+RationalRows = Sequence[Sequence[Fraction]]
+
+
+def _weights(u: Scalar, rows: RationalRows, derivatives: int) -> list[list[Scalar]]:
+    """Polynomials of u and their derivatives, by Horner's rule: the cumulative basis without its first row."""
+    table = []
+    for _ in range(derivatives + 1):
+        values: list[Scalar] = []
+        for row in rows:
+            value: Scalar = float(row[-1])
+            for coefficient in reversed(row[:-1]):
+                value = plus(times(value, u), float(coefficient))
+            values.append(value)
+        table.append(values)
+        rows = [[*(n * c for n, c in enumerate(row) if n > 0), Fraction(0)] for row in rows]
+    return table
+
+
+def _chop(v: Vector, size: int) -> list[Vector]:
+    return [v[i : i + size] for i in range(0, len(v), size)]
+
+
+def forward_program(
+    group: GroupArithmetic, rows: RationalRows, derivatives: int, dtype: torch.dtype
+) -> Trace:
+    """Inputs u, start, steps, scale (1/dt, 1/dt^2, ...); outputs value and scaled rates."""
+    count = len(rows)
+
+    def run(u: Vector, start: Vector, steps: Vector, scales: Vector) -> list[Scalar]:
+        weights = _weights(u[0], rows, derivatives)
+        value, sweep = forward(
+            group, start, _chop(steps, group.tangent_size), weights, derivatives, short=True
+        )
+        rates = (scale(s, rate) for s, rate in zip(scales, sweep[-1].rates, strict=True))
+        return [*value, *(c for rate in rates for c in rate)]
+
+    return trace(run, [1, group.point_size, count * group.tangent_size, derivatives], dtype)
+
+
+def reverse_program(
+    group: GroupArithmetic, rows: RationalRows, derivatives: int, dtype: torch.dtype
+) -> Trace:
+    """Inputs u, value, its cotangent, rate cotangents, steps, scale; outputs body cotangents of start and steps, and
+    the cotangent of u."""
+    count, size = len(rows), group.tangent_size
+
+    def run(
+        u: Vector, value: Vector, value_g: Vector, rates_g: Vector, steps: Vector, scales: Vector
+    ) -> list[Scalar]:
+        weights = _weights(u[0], rows, derivatives + 1)
+        chopped = _chop(steps, size)
+        used = weights[: derivatives + 1]
+        # The value of this sweep is not used: the one of the forward pass is an input, so composing is left out.
+        _, sweep = forward(group, value, chopped, used, derivatives, short=True)
+        cotangents = [scale(s, g) for s, g in zip(scales, _chop(rates_g, size), strict=True)]
+        start_g, steps_g, weights_g = reverse(
+            group, chopped, used, sweep, group.pull(value, value_g), cotangents, short=True
+        )
+        u_g: Scalar = 0.0
+        for row_g, next_row in zip(weights_g, weights[1:], strict=True):
+            for g, rate in zip(row_g, next_row, strict=True):
+                u_g = plus(u_g, times(g, rate))
+        return [*start_g, *(c for g in steps_g for c in g), u_g]
+
+    sizes = [1, group.point_size, group.point_size, derivatives * size, count * size, derivatives]
+    return trace(run, sizes, dtype)
+
+
+def pairs_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
+    """Inputs stored neighbours a, b; outputs unit a, the logarithm from a to b, 1 for each sign block to flip."""
+
+    def run(a: Vector, b: Vector) -> list[Scalar]:
+        unit = group.normalize(a)
+        between = group.between(unit, group.normalize(b))
+        flips = [flip.graph.record("where", flip, 1.0, 0.0) for flip in group.long_way(between)]
+        return [*unit, *group.log(between), *flips]
+
+    return trace(run, [group.point_size, group.point_size], dtype)
+
+
+def pairs_reverse_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
+    """Inputs the logarithm of a pair and its cotangent; outputs body cotangents of second and first."""
+
+    def run(d: Vector, g: Vector) -> list[Scalar]:
+        second = group.right_jacobian_inverse_transpose(d, g, short=True)
+        first = negate(group.left_jacobian_inverse_transpose(d, g, short=True))
+        return [*second, *first]
+
+    return trace(run, [group.tangent_size] * 2, dtype)
+
+
+def embed_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
+    """Inputs stored numbers and a body cotangent; outputs the Euclidean gradient."""
+    return trace(lambda stored, g: group.embed(stored, g), [group.point_size, group.tangent_size], dtype)

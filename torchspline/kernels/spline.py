@@ -1,0 +1,259 @@
+"""The compiled sweeps of a uniform cumulative B-spline: on NumPy arrays, flat, no autograd.
+
+Symbols: B trajectories of M control points with P numbers and D dimensions, N times each, shared by all or not.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache, cached_property, partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchspline.arithmetic.registry import arithmetic
+from torchspline.kernels import emit, programs
+from torchspline.kernels.build import compiled
+from torchspline.kernels.threads import SERIAL_BELOW, run, spans
+
+Array = NDArray[Any]
+
+#: Queries a chunk of the reverse sweep. Chunks are summed in order whatever the number of threads, so that gradients
+#: are the same to the last bit.
+REVERSE_CHUNK = 16384
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Times of all queries, flat, and the knots they refer to; seconds in float64 or whole nanoseconds."""
+
+    times: Array
+    shared: bool
+    t0: float | int
+    dt: float | int
+    tolerance: float
+    segments: int
+    points: int
+    trajectories: int
+
+    @property
+    def queries(self) -> int:
+        return len(self.times) if self.shared else len(self.times) // max(self.trajectories, 1)
+
+    def arguments(self) -> tuple:
+        t0, dt = self.t0, self.dt
+        return self.times, self.shared, t0, dt, self.tolerance, self.segments, self.points, self.queries
+
+    def reach(self, begin: int, stop: int, order: int) -> tuple[int, int]:
+        """First and last-but-one control point that queries `begin` to `stop` touch, over all trajectories."""
+        first, last = begin // self.queries, (stop - 1) // self.queries
+        everything = first * self.points, (last + 1) * self.points
+        if first < last:
+            return everything
+        offset = first * self.queries if self.shared else 0
+        times = self.times[begin - offset : stop - offset]
+        low, high = ((float(t) - self.t0) / self.dt for t in (times.min(), times.max()))
+        if not np.isfinite(low + high):
+            return everything
+        start = min(max(int(low) - 1, 0), self.segments - 1)
+        end = min(max(int(high) + 2, 1), self.segments) + order - 1
+        return first * self.points + start, first * self.points + min(end, self.points)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What control points alone determine: unit points of continuous sign and logarithms of neighbours, flat."""
+
+    unit: Array
+    logs: Array
+
+
+class SplineKernels:
+    """Kernels of one group, order, number of derivatives, precision and kind of time; compiled when first used."""
+
+    def __init__(
+        self,
+        group: str,
+        rows: Sequence[Sequence[Fraction]],
+        derivatives: int,
+        dtype: torch.dtype,
+        nanoseconds: bool,
+    ):
+        self.group, self.rows, self.derivatives = arithmetic(group), rows, derivatives
+        self.dtype, self.nanoseconds = dtype, nanoseconds
+        self.real = np.float32 if dtype == torch.float32 else np.float64
+        self.order = len(rows) + 1
+
+    # ------------------------------------------------------------------ forward
+
+    def pairs(self, stored: Array, trajectories: int, points: int) -> Pairs:
+        """Once for every pair of neighbours; a pair across two trajectories is computed too, and never read."""
+        P, D, total = self.group.point_size, self.group.tangent_size, trajectories * points
+        blocks = self.group.sign_blocks
+        unit, logs = np.empty(total * P, self.real), np.empty(total * D, self.real)
+        flips = np.empty(total * len(blocks), self.real)
+        function, end = self._pairs, total - 1
+        function(stored, stored[P:], unit, logs, flips, 0, end)
+        # The last point has no neighbour: only its unit representative is wanted.
+        last = stored[end * P :]
+        function(last, last, unit[end * P :], logs[end * D :], flips[end * len(blocks) :], 0, 1)
+        if blocks and flips.any():
+            odd = np.zeros((trajectories, points, len(blocks)), dtype=bool)
+            inside = flips.reshape(trajectories, points, len(blocks))[:, :-1]
+            np.logical_xor.accumulate(inside != 0, axis=1, out=odd[:, 1:])
+            shaped = unit.reshape(trajectories, points, P)
+            for b, (start, stop) in enumerate(blocks):
+                np.negative(shaped[..., start:stop], out=shaped[..., start:stop], where=odd[..., b : b + 1])
+        return Pairs(unit, logs)
+
+    def forward(self, pairs: Pairs, clock: Clock, outputs: Sequence[Array]) -> int:
+        """Fill value and rates (per second); how many times lie outside the domain."""
+        total = clock.trajectories * clock.queries
+        arguments = (*clock.arguments(), self._scale(clock), *outputs)
+        function, outside = self._forward, []
+
+        def part(begin: int, stop: int) -> None:
+            outside.append(function(pairs.unit, pairs.logs, *arguments, begin, stop))
+
+        parts = torch.get_num_threads() if total >= 2 * SERIAL_BELOW else 1
+        run([partial(part, begin, stop) for begin, stop in spans(total, parts, emit.BLOCK)])
+        return sum(outside)
+
+    # ------------------------------------------------------------------ reverse
+
+    def reverse(
+        self,
+        stored: Array,
+        pairs: Pairs,
+        clock: Clock,
+        value: Array,
+        value_g: Array,
+        rates_g: Sequence[Array],
+    ) -> tuple[Array, Array]:
+        """Gradients of the stored control points and of the place u in a segment of every query."""
+        P, D = self.group.point_size, self.group.tangent_size
+        total, points = clock.trajectories * clock.queries, clock.trajectories * clock.points
+        u_g = np.empty(total, self.real)
+        start_g, logs_g = np.zeros(points * D, self.real), np.zeros(points * D, self.real)
+        arguments = (*clock.arguments(), self._scale(clock), value, value_g, *rates_g)
+        function = self._reverse
+
+        def chunk(begin: int, stop: int, first: int, start: Array, logs: Array) -> None:
+            function(pairs.logs, *arguments, first, start, logs, u_g, begin, stop)
+
+        chunks = spans(total, _chunk_count(total, points), emit.BLOCK)
+        if len(chunks) == 1:
+            chunk(0, total, 0, start_g, logs_g)
+        else:
+            reaches = [clock.reach(begin, stop, self.order) for begin, stop in chunks]
+            sums = [np.zeros((2, (last - first) * D), self.real) for first, last in reaches]
+            run(
+                [
+                    partial(chunk, begin, stop, first, part[0], part[1])
+                    for (begin, stop), (first, _), part in zip(chunks, reaches, sums, strict=True)
+                ]
+            )
+            for (first, last), part in zip(reaches, sums, strict=True):
+                for whole, share in ((start_g, part[0]), (logs_g, part[1])):
+                    here = whole[first * D : last * D]
+                    np.add(here, share, out=here)
+        return self._to_stored(stored, pairs, clock, start_g, logs_g, P, D), u_g
+
+    def _to_stored(
+        self, stored: Array, pairs: Pairs, clock: Clock, start_g: Array, logs_g: Array, P: int, D: int
+    ) -> Array:
+        """Through the logarithms of neighbours to body cotangents, and from those to stored numbers."""
+        points = clock.trajectories * clock.points
+        second, first = np.empty(points * D, self.real), np.empty(points * D, self.real)
+        self._pairs_reverse(pairs.logs, logs_g, second, first, 0, points)
+        body = start_g.reshape(clock.trajectories, clock.points, D)
+        for here, share in ((body[:, 1:], second), (body[:, :-1], first)):
+            np.add(here, share.reshape(body.shape)[:, :-1], out=here)
+        gradient = np.empty(points * P, self.real)
+        self._embed(stored, start_g, gradient, 0, points)
+        return gradient
+
+    def _scale(self, clock: Clock) -> Array:
+        seconds = clock.dt * 1e-9 if self.nanoseconds else clock.dt
+        return np.array([seconds ** -(r + 1) for r in range(self.derivatives)], dtype=self.real)
+
+    # ------------------------------------------------------------------ compilation
+
+    def _types(self, *kinds: str) -> str:
+        """A Numba signature from a letter an argument: r array of reals, t array of times, s a time, b i f scalars."""
+        real = self.real.__name__
+        time = "int64" if self.nanoseconds else "float64"
+        letters = {
+            "r": f"{real}[::1]",
+            "t": f"{time}[::1]",
+            "s": time,
+            "b": "boolean",
+            "i": "int64",
+            "f": "float64",
+        }
+        return f"({', '.join(letters[letter] for letter in ''.join(kinds))})"
+
+    def _name(self, kind: str) -> str:
+        return f"{kind}_{self.group.name}_k{self.order}_d{self.derivatives}_{self.real.__name__}"
+
+    def _map(self, kind: str, program: programs.Trace, sizes: list[int], results: list[int]) -> Callable:
+        name = f"{kind}_{self.group.name}_{self.real.__name__}"
+        source = emit.emit_map(name, program, sizes, results, self.dtype)
+        return compiled(name, source, self._types("r" * (len(sizes) + len(results)), "ii"))
+
+    @cached_property
+    def _pairs(self) -> Callable:
+        P, D = self.group.point_size, self.group.tangent_size
+        program = programs.pairs_program(self.group, self.dtype)
+        return self._map("pairs", program, [P, P], [P, D, len(self.group.sign_blocks)])
+
+    @cached_property
+    def _pairs_reverse(self) -> Callable:
+        D = self.group.tangent_size
+        return self._map(
+            "pairs_reverse", programs.pairs_reverse_program(self.group, self.dtype), [D, D], [D, D]
+        )
+
+    @cached_property
+    def _embed(self) -> Callable:
+        P, D = self.group.point_size, self.group.tangent_size
+        return self._map("embed", programs.embed_program(self.group, self.dtype), [P, D], [P])
+
+    @cached_property
+    def _forward(self) -> Callable:
+        return compiled(
+            self._name("forward"),
+            self.forward_source(),
+            self._types("rrtbssfiii", "r", "r" * (self.derivatives + 1), "ii"),
+        )
+
+    @cached_property
+    def _reverse(self) -> Callable:
+        arguments = self._types("rtbssfiii", "r", "rr", "r" * self.derivatives, "i", "rrr", "ii")
+        return compiled(self._name("reverse"), self.reverse_source(), arguments)
+
+    def forward_source(self) -> str:
+        program = programs.forward_program(self.group, self.rows, self.derivatives, self.dtype)
+        return emit.emit_forward(self._name("forward"), program, *self._sizes(), self.dtype, self.nanoseconds)
+
+    def reverse_source(self) -> str:
+        program = programs.reverse_program(self.group, self.rows, self.derivatives, self.dtype)
+        return emit.emit_reverse(self._name("reverse"), program, *self._sizes(), self.dtype, self.nanoseconds)
+
+    def _sizes(self) -> tuple[int, int, int, int]:
+        return self.group.point_size, self.group.tangent_size, self.order - 1, self.derivatives
+
+
+def _chunk_count(total: int, points: int) -> int:
+    """How many pieces of the reverse sweep, from sizes alone; sums of unsorted times may need all points each."""
+    return max(1, min(total // REVERSE_CHUNK, 4 * total // max(points, 1), 256))
+
+
+@cache
+def spline_kernels(
+    group: str, rows: Sequence[Sequence[Fraction]], derivatives: int, dtype: torch.dtype, nanoseconds: bool
+) -> SplineKernels:
+    """One set of kernels for each combination in a process."""
+    return SplineKernels(group, rows, derivatives, dtype, nanoseconds)

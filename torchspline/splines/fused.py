@@ -1,0 +1,170 @@
+"""The uniform B-spline through compiled kernels: one call forward, one call backward."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from torchspline.kernels.mode import transformed
+from torchspline.kernels.spline import Clock, Pairs, SplineKernels, spline_kernels
+from torchspline.splines.basis import cumulative_matrix
+from torchspline.splines.clock import tolerance
+
+
+class OutsideError(Exception):
+    """Some times lie outside the domain; the reference says which."""
+
+
+@dataclass
+class Call:
+    """What does not change hands as a tensor: sizes, knots as numbers, and the same computation by the reference."""
+
+    kernels: SplineKernels
+    segments: int
+    t0: float | int
+    dt: float | int
+    #: How far outside the domain times may lie, in knot spacings; None: anywhere.
+    tolerance: float | None
+    #: (control_points, t, t0, dt) -> value and rates per second.
+    reference: Callable[[Tensor, Tensor, Any, Any], tuple[Tensor, ...]]
+    pairs: Pairs = field(init=False)
+
+    def clock(self, control_points: Tensor, t: Tensor) -> Clock:
+        trajectories = control_points.shape[:-2].numel()
+        return Clock(
+            _flat(t),
+            t.ndim == 1,
+            self.t0,
+            self.dt,
+            float("inf") if self.tolerance is None else self.tolerance,
+            self.segments,
+            control_points.shape[-2],
+            trajectories,
+        )
+
+
+def fused_bspline(
+    control_points: Tensor,
+    t: Tensor,
+    t0: Tensor | float | int,
+    dt: Tensor | float | int,
+    kernels: SplineKernels,
+    segments: int,
+    validate: bool,
+    reference: Callable[[Tensor, Tensor, Any, Any], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...] | None:
+    """Value and rates per second, or None if a time lies outside the domain (or is NaN).
+
+    Args:
+        t: `(N,)` or `(*batch, N)`; t0, dt: numbers or 0-dim tensors; `reference` does the same on tensors.
+    """
+    start, spacing = _number(t0), _number(dt)
+    slack = float(tolerance(t, start, spacing, segments)) if validate else None
+    call = Call(kernels, segments, start, spacing, slack, reference)
+    times = t if t.dtype == torch.int64 else t.to(torch.float64)
+    try:
+        return FusedBSpline.apply(control_points, times, _learnt(t0), _learnt(dt), call)
+    except OutsideError:
+        return None
+
+
+def _number(x: Tensor | float | int) -> float | int:
+    return x.item() if isinstance(x, Tensor) else x
+
+
+def _learnt(x: Tensor | float | int) -> Tensor | None:
+    return x if isinstance(x, Tensor) and x.requires_grad else None
+
+
+def kernels_of(group: str, order: int, derivatives: int, control_points: Tensor, t: Tensor) -> SplineKernels:
+    rows = cumulative_matrix(order)[1:]
+    return spline_kernels(group, rows, derivatives, control_points.dtype, t.dtype == torch.int64)
+
+
+def _flat(x: Tensor):
+    return x.detach().contiguous().numpy().reshape(-1)
+
+
+class FusedBSpline(Function):
+    """Value and rates per second of control points `(*batch, M, P)` at `t` `(N,)` or `(*batch, N)`.
+
+    `t` is float64 or int64; `t0` and `dt` are tensors if they require grad, else None.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, control_points: Tensor, t: Tensor, t0: Tensor | None, dt: Tensor | None, call: Call
+    ) -> tuple[Tensor, ...]:
+        group = call.kernels.group
+        batch = control_points.shape[:-2]
+        clock = call.clock(control_points, t)
+        call.pairs = call.kernels.pairs(_flat(control_points), clock.trajectories, clock.points)
+        sizes = [group.point_size, *[group.tangent_size] * call.kernels.derivatives]
+        outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
+        outside = call.kernels.forward(call.pairs, clock, [_flat(x) for x in outputs])
+        if outside:
+            raise OutsideError
+        ctx.call = call
+        ctx.save_for_backward(control_points, t, t0, dt, *outputs)
+        ctx.set_materialize_grads(False)
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        control_points, t, t0, dt, *outputs = ctx.saved_tensors
+        call: Call = ctx.call
+        if torch.is_grad_enabled() or transformed() or not all(map(_plain, cotangents)):
+            return *_through_reference(call, (control_points, t, t0, dt), cotangents), None
+        filled = [torch.zeros_like(x) if c is None else c for c, x in zip(cotangents, outputs, strict=True)]
+        clock = call.clock(control_points, t)
+        value, value_g, *rates_g = map(_flat, (outputs[0], *filled))
+        stored_g, u_g = call.kernels.reverse(
+            _flat(control_points), call.pairs, clock, value, value_g, rates_g
+        )
+        t_g = None
+        if any(ctx.needs_input_grad[1:4]):
+            t_g = torch.from_numpy(u_g).reshape(outputs[0].shape[:-1]).to(torch.float64) / call.dt
+        t0_g = -t_g.sum() if t0 is not None and t_g is not None else None
+        dt_g = None
+        if dt is not None and t_g is not None:
+            # u = (t - t0) / dt - segment, and the r-th rate carries a factor dt^-r.
+            dt_g = -(t_g * (t - call.t0)).sum()
+            for r, (g, x) in enumerate(zip(filled, outputs, strict=True)):
+                dt_g = dt_g - r * (g * x).sum(dtype=torch.float64)
+            dt_g = dt_g / call.dt
+        if t_g is not None:
+            t_g = t_g.sum_to_size(t.shape) if ctx.needs_input_grad[1] else None
+        return torch.from_numpy(stored_g).reshape(control_points.shape), t_g, t0_g, dt_g, None
+
+
+def _plain(x: Tensor | None) -> bool:
+    """Whether a cotangent is numbers in memory rather than a batch in disguise (`is_grads_batched`)."""
+    functorch = torch._C._functorch
+    return x is None or not (functorch.is_batchedtensor(x) or functorch.is_legacy_batchedtensor(x))
+
+
+def _through_reference(
+    call: Call,
+    saved: tuple[Tensor, Tensor, Tensor | None, Tensor | None],
+    cotangents: tuple[Tensor | None, ...],
+) -> list[Tensor | None]:
+    """Gradients as differentiable operations: the reference run again on the saved tensors, whose graph it extends."""
+    wanted = [x for x in saved if x is not None and x.requires_grad]
+    again = torch.is_grad_enabled()
+    with torch.enable_grad():
+        control_points, t, t0, dt = saved
+        outputs = call.reference(
+            control_points, t, call.t0 if t0 is None else t0, call.dt if dt is None else dt
+        )
+        used = [(x, g) for x, g in zip(outputs, cotangents, strict=True) if g is not None and x.requires_grad]
+        if not used:
+            return [None] * len(saved)
+        gradients = iter(
+            torch.autograd.grad(
+                [x for x, _ in used], wanted, [g for _, g in used], create_graph=again, allow_unused=True
+            )
+        )
+    return [next(gradients) if x is not None and x.requires_grad else None for x in saved]
