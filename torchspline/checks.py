@@ -177,6 +177,16 @@ def choice(name: str, x: str, allowed: Sequence[str]) -> str:
     return x
 
 
+def seen_number(x: Tensor) -> float | None:
+    """The number in a 0-dim tensor, or None where values cannot be seen."""
+    if not values_visible(x):
+        return None
+    try:
+        return x.item()
+    except RuntimeError:
+        return None
+
+
 def seen_true(condition: Tensor) -> bool | None:
     """Its value, or None where torch will not tell (inside `vmap`)."""
     try:

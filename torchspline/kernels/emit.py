@@ -80,6 +80,46 @@ def emit_map(name: str, program: Trace, sizes: list[int], results: list[int], dt
     )
 
 
+def emit_pairs(
+    name: str,
+    program: Trace,
+    point: int,
+    tangent: int,
+    blocks: tuple[tuple[int, int], ...],
+    dtype: torch.dtype,
+) -> str:
+    """`name(stored, points, unit, logs, begin, stop)`: unit points of continuous sign and logarithms of neighbours, for
+    trajectories of `points` control points each; returns how many are not points.
+
+    The pair across two trajectories is computed like any other and never read.
+    """
+    flips = point + tangent
+    gather = [
+        "here = block + i",
+        "next = min(here + 1, stop - 1)",
+        *(f"X[{c * BLOCK} + i] = stored[here * {point} + {c}]" for c in range(point)),
+        *(f"X[{(point + c) * BLOCK} + i] = stored[next * {point} + {c}]" for c in range(point)),
+    ]
+    scatter = [
+        "here = block + i",
+        "if here % points == 0:",
+        *(f"    far{b} = False" for b in range(len(blocks))),
+        *([] if blocks else ["    pass"]),
+        *(f"unit[here * {point} + {c}] = Y[{c * BLOCK} + i]" for c in range(point)),
+        *(f"logs[here * {tangent} + {c}] = Y[{(point + c) * BLOCK} + i]" for c in range(tangent)),
+    ]
+    for b, (start, stop) in enumerate(blocks):
+        scatter += [
+            f"if far{b}:",
+            *(f"    unit[here * {point} + {c}] = -unit[here * {point} + {c}]" for c in range(start, stop)),
+            f"far{b} ^= Y[{(flips + b) * BLOCK} + i] != 0.0",
+        ]
+    scatter.append(f"bad += Y[{(flips + len(blocks)) * BLOCK} + i] != 0.0")
+    before = ["bad = 0", *(f"far{b} = False" for b in range(len(blocks)))]
+    parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return bad"]}
+    return _source(name, ["stored", "points", "unit", "logs", "begin", "stop"], program, dtype, parts)
+
+
 def _locate(nanoseconds: bool) -> list[str]:
     """Segment and place within it of query `block + i`, as in `splines/clock.py`, and the row of its trajectory."""
     if nanoseconds:
@@ -91,7 +131,7 @@ def _locate(nanoseconds: bool) -> list[str]:
     else:
         place = [
             "s = (times[column if shared else block + i] - t0) / dt",
-            "floor = min(max(math.floor(s), 0.0), segments - 1.0) if s == s else 0.0",
+            "floor = min(max(np.floor(s), 0.0), segments - 1.0) if s == s else 0.0",
             "segment = int(floor)",
             "u = s - floor",
         ]

@@ -8,8 +8,9 @@ import torch
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.recurrence import forward, reverse
 from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, negate, plus, scale, times
-from torchspline.kernels.trace import Trace, trace
+from torchspline.arithmetic.vector import Vector, dot, negate, plus, scale, times
+from torchspline.checks import LONGEST_QUATERNION, SHORTEST_QUATERNION
+from torchspline.kernels.trace import Symbol, Trace, trace
 
 RationalRows = Sequence[Sequence[Fraction]]
 
@@ -80,15 +81,32 @@ def reverse_program(
 
 
 def pairs_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
-    """Inputs stored neighbours a, b; outputs unit a, the logarithm from a to b, 1 for each sign block to flip."""
+    """Inputs stored neighbours a, b; outputs unit a, the logarithm from a to b, 1 for each sign block to flip, and 1 if
+    a is not a point: a number that is not finite, a quaternion too short or long to divide by."""
 
     def run(a: Vector, b: Vector) -> list[Scalar]:
         unit = group.normalize(a)
         between = group.between(unit, group.normalize(b))
-        flips = [flip.graph.record("where", flip, 1.0, 0.0) for flip in group.long_way(between)]
-        return [*unit, *group.log(between), *flips]
+        flips = [_indicator(flip) for flip in group.long_way(between)]
+        return [*unit, *group.log(between), *flips, 1.0 - _indicator(_valid(group, a))]
 
     return trace(run, [group.point_size, group.point_size], dtype)
+
+
+def _indicator(condition: Symbol) -> Symbol:
+    return condition.graph.record("where", condition, 1.0, 0.0)
+
+
+def _valid(group: GroupArithmetic, stored: Vector) -> Symbol:
+    difference: Scalar = 0.0
+    for x in stored:
+        difference = difference + (x - x)  # 0, or not a number if x is infinite or not a number
+    valid = difference == 0.0
+    shortest, longest = (SHORTEST_QUATERNION * 0.999) ** 2, (LONGEST_QUATERNION * 1.001) ** 2
+    for start, stop in group.sign_blocks:
+        squared = dot(stored[start:stop], stored[start:stop])
+        valid = valid & (squared > shortest) & (squared < longest)
+    return valid
 
 
 def pairs_reverse_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:

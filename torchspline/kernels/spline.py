@@ -6,7 +6,7 @@ Symbols: B trajectories of M control points with P numbers and D dimensions, N t
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -88,25 +88,13 @@ class SplineKernels:
 
     # ------------------------------------------------------------------ forward
 
-    def pairs(self, stored: Array, trajectories: int, points: int) -> Pairs:
-        """Once for every pair of neighbours; a pair across two trajectories is computed too, and never read."""
-        P, D, total = self.group.point_size, self.group.tangent_size, trajectories * points
-        blocks = self.group.sign_blocks
-        unit, logs = np.empty(total * P, self.real), np.empty(total * D, self.real)
-        flips = np.empty(total * len(blocks), self.real)
-        function, end = self._pairs, total - 1
-        function(stored, stored[P:], unit, logs, flips, 0, end)
-        # The last point has no neighbour: only its unit representative is wanted.
-        last = stored[end * P :]
-        function(last, last, unit[end * P :], logs[end * D :], flips[end * len(blocks) :], 0, 1)
-        if blocks and flips.any():
-            odd = np.zeros((trajectories, points, len(blocks)), dtype=bool)
-            inside = flips.reshape(trajectories, points, len(blocks))[:, :-1]
-            np.logical_xor.accumulate(inside != 0, axis=1, out=odd[:, 1:])
-            shaped = unit.reshape(trajectories, points, P)
-            for b, (start, stop) in enumerate(blocks):
-                np.negative(shaped[..., start:stop], out=shaped[..., start:stop], where=odd[..., b : b + 1])
-        return Pairs(unit, logs)
+    def pairs(self, stored: Array, trajectories: int, points: int) -> tuple[Pairs, int]:
+        """Once for every pair of neighbours; and how many control points are not valid points."""
+        total = trajectories * points
+        unit = np.empty(total * self.group.point_size, self.real)
+        logs = np.empty(total * self.group.tangent_size, self.real)
+        bad = self._pairs(stored, points, unit, logs, 0, total)
+        return Pairs(unit, logs), bad
 
     def forward(self, pairs: Pairs, clock: Clock, outputs: Sequence[Array]) -> int:
         """Fill value and rates (per second); how many times lie outside the domain."""
@@ -205,9 +193,12 @@ class SplineKernels:
 
     @cached_property
     def _pairs(self) -> Callable:
-        P, D = self.group.point_size, self.group.tangent_size
-        program = programs.pairs_program(self.group, self.dtype)
-        return self._map("pairs", program, [P, P], [P, D, len(self.group.sign_blocks)])
+        group, name = self.group, f"pairs_{self.group.name}_{self.real.__name__}"
+        program = programs.pairs_program(group, self.dtype)
+        source = emit.emit_pairs(
+            name, program, group.point_size, group.tangent_size, group.sign_blocks, self.dtype
+        )
+        return compiled(name, source, self._types("rirr", "ii"))
 
     @cached_property
     def _pairs_reverse(self) -> Callable:
@@ -249,11 +240,3 @@ class SplineKernels:
 def _chunk_count(total: int, points: int) -> int:
     """How many pieces of the reverse sweep, from sizes alone; sums of unsorted times may need all points each."""
     return max(1, min(total // REVERSE_CHUNK, 4 * total // max(points, 1), 256))
-
-
-@cache
-def spline_kernels(
-    group: str, rows: Sequence[Sequence[Fraction]], derivatives: int, dtype: torch.dtype, nanoseconds: bool
-) -> SplineKernels:
-    """One set of kernels for each combination in a process."""
-    return SplineKernels(group, rows, derivatives, dtype, nanoseconds)

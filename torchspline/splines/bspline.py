@@ -1,5 +1,6 @@
 """Uniform cumulative B-splines on any Lie group, [S20]: the function and the module."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -55,14 +56,14 @@ def bspline(
         TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
     """
     group = _as_group(group)
-    _check_control_points(control_points, group, order, validate)
+    _check_control_points(control_points, group, order)
     if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
         raise ValueError(
             f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
         )
     checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
     start, spacing = _knots(t, dt, t0, dt_ns, t0_ns)
-    _check_times(t, control_points, validate)
+    _check_times(t, control_points)
 
     segments = control_points.shape[-2] - order + 1
     control_points, times, shape = _align(control_points, t)
@@ -82,13 +83,21 @@ def bspline(
 
     fields = None
     if extrapolate == "error" and usable(control_points, times, start, spacing):
-        kernels = kernels_of(group.name, order, derivatives, control_points, times)
+        kernels = kernels_of(group.name, order, derivatives, control_points.dtype, times.dtype == torch.int64)
         if validate:
             check_float32(times, spacing)
         fields = fused_bspline(control_points, times, start, spacing, kernels, segments, validate, reference)
-    if fields is None:  # no kernel, or a time outside, which the reference explains
+    if fields is None:  # no kernel serves this call, or it met a value which the checks below explain
+        if validate:
+            _check_values(control_points, group)
+            if t.dtype != torch.int64:
+                checks.finite("t", t)
         fields = reference(control_points, times, start, spacing)
-    return State(*(field.reshape(*shape, field.shape[-1]) for field in fields))
+    return State(*(_shaped(field, shape) for field in fields))
+
+
+def _shaped(field: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return field if field.shape[:-1] == shape else field.reshape(*shape, field.shape[-1])
 
 
 def _as_group(group: Group) -> Group:
@@ -96,7 +105,7 @@ def _as_group(group: Group) -> Group:
     return group
 
 
-def _check_control_points(control_points: Tensor, group: Group, order: int, validate: bool) -> None:
+def _check_control_points(control_points: Tensor, group: Group, order: int) -> None:
     checks.is_floating_tensor("control_points", control_points)
     checks.whole("order", order, least=2)
     if control_points.ndim < 2 or control_points.shape[-1] != group.point_size:
@@ -108,9 +117,11 @@ def _check_control_points(control_points: Tensor, group: Group, order: int, vali
         raise ValueError(
             f"control_points: order {order} needs at least {order} control points, got {control_points.shape[-2]}"
         )
-    if validate:
-        checks.finite("control_points", control_points)
-        checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
+
+
+def _check_values(control_points: Tensor, group: Group) -> None:
+    checks.finite("control_points", control_points)
+    checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
 
 
 def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any]:
@@ -139,10 +150,10 @@ def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, An
     if t.dtype == torch.int64:
         raise TypeError("t: int64 times are nanoseconds and go with dt_ns and t0_ns; got dt in seconds")
     checks.is_floating_tensor("t", t)
-    return _seconds("t0", t0, t), _seconds("dt", dt, t, positive=True)
+    return _seconds("t0", t0, t, checks.finite_number), _seconds("dt", dt, t, checks.positive)
 
 
-def _seconds(name: str, x: Any, t: Tensor, positive: bool = False) -> Any:
+def _seconds(name: str, x: Any, t: Tensor, check: Callable[[str, float], float]) -> Any:
     if isinstance(x, Tensor):
         checks.is_floating_tensor(name, x)
         if x.ndim != 0:
@@ -151,26 +162,21 @@ def _seconds(name: str, x: Any, t: Tensor, positive: bool = False) -> Any:
             raise ValueError(
                 f"{name}: on device {x.device}, but t is on {t.device}; move one with .to(device)"
             )
-        checks.finite(name, x)
-        if positive and checks.values_visible(x) and checks.seen_true(x.detach() <= 0):
-            raise ValueError(f"{name}: expected a number above zero, got {x.item()}")
+        if (number := checks.seen_number(x)) is not None:
+            check(name, number)
         return x.to(torch.float64)
     if isinstance(x, bool) or not isinstance(x, (int, float)):
         raise TypeError(f"{name}: expected seconds as a number or a 0-dim tensor, got {type(x).__name__}")
-    if positive:
-        return checks.positive(name, float(x))
-    return checks.finite_number(name, float(x))
+    return check(name, float(x))
 
 
-def _check_times(t: Tensor, control_points: Tensor, validate: bool) -> None:
+def _check_times(t: Tensor, control_points: Tensor) -> None:
     if t.device != control_points.device:
         raise ValueError(
             f"t: on device {t.device}, but control_points are on {control_points.device}; move one with .to(device)"
         )
     if t.ndim > 1:
         checks.broadcast(control_points=control_points.shape[:-2], t=t.shape[:-1])
-    if validate and t.dtype != torch.int64:
-        checks.finite("t", t)
 
 
 def _align(control_points: Tensor, t: Tensor) -> tuple[Tensor, Tensor, tuple[int, ...]]:
@@ -233,7 +239,8 @@ class BSpline(Trajectory):
     ):
         super().__init__()
         self.group = _as_group(group)
-        _check_control_points(control_points, group, order, validate=True)
+        _check_control_points(control_points, group, order)
+        _check_values(control_points, group)
         checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
         self.order, self.extrapolate, self.validate = order, extrapolate, validate
         self.control_points: Tensor

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import torch
@@ -9,13 +10,13 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchspline.kernels.mode import transformed
-from torchspline.kernels.spline import Clock, Pairs, SplineKernels, spline_kernels
+from torchspline.kernels.spline import Clock, Pairs, SplineKernels
 from torchspline.splines.basis import cumulative_matrix
 from torchspline.splines.clock import tolerance
 
 
-class OutsideError(Exception):
-    """Some times lie outside the domain; the reference says which."""
+class RefusedError(Exception):
+    """A control point is not a point or a time lies outside the domain; the reference's checks say which."""
 
 
 @dataclass
@@ -56,7 +57,7 @@ def fused_bspline(
     validate: bool,
     reference: Callable[[Tensor, Tensor, Any, Any], tuple[Tensor, ...]],
 ) -> tuple[Tensor, ...] | None:
-    """Value and rates per second, or None if a time lies outside the domain (or is NaN).
+    """Value and rates per second, or None if a number is not acceptable.
 
     Args:
         t: `(N,)` or `(*batch, N)`; t0, dt: numbers or 0-dim tensors; `reference` does the same on tensors.
@@ -67,7 +68,7 @@ def fused_bspline(
     times = t if t.dtype == torch.int64 else t.to(torch.float64)
     try:
         return FusedBSpline.apply(control_points, times, _learnt(t0), _learnt(dt), call)
-    except OutsideError:
+    except RefusedError:
         return None
 
 
@@ -79,9 +80,12 @@ def _learnt(x: Tensor | float | int) -> Tensor | None:
     return x if isinstance(x, Tensor) and x.requires_grad else None
 
 
-def kernels_of(group: str, order: int, derivatives: int, control_points: Tensor, t: Tensor) -> SplineKernels:
-    rows = cumulative_matrix(order)[1:]
-    return spline_kernels(group, rows, derivatives, control_points.dtype, t.dtype == torch.int64)
+@cache
+def kernels_of(
+    group: str, order: int, derivatives: int, dtype: torch.dtype, nanoseconds: bool
+) -> SplineKernels:
+    """One set of kernels for each combination in a process."""
+    return SplineKernels(group, cumulative_matrix(order)[1:], derivatives, dtype, nanoseconds)
 
 
 def _flat(x: Tensor):
@@ -101,12 +105,14 @@ class FusedBSpline(Function):
         group = call.kernels.group
         batch = control_points.shape[:-2]
         clock = call.clock(control_points, t)
-        call.pairs = call.kernels.pairs(_flat(control_points), clock.trajectories, clock.points)
+        call.pairs, bad = call.kernels.pairs(_flat(control_points), clock.trajectories, clock.points)
+        if bad and call.tolerance is not None:
+            raise RefusedError
         sizes = [group.point_size, *[group.tangent_size] * call.kernels.derivatives]
         outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
         outside = call.kernels.forward(call.pairs, clock, [_flat(x) for x in outputs])
         if outside:
-            raise OutsideError
+            raise RefusedError
         ctx.call = call
         ctx.save_for_backward(control_points, t, t0, dt, *outputs)
         ctx.set_materialize_grads(False)

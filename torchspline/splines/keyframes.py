@@ -5,7 +5,6 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.groups.group import Group
-from torchspline.splines.basis import blending_matrix
 from torchspline.splines.sweep import cumulative_bspline
 
 #: The correction of a phantom point converges linearly, by about a factor of 10 for rotations of 0.5 rad.
@@ -33,58 +32,32 @@ def phantom_points(keyframes: Tensor, group: Group, order: int = 4) -> Tensor:
     """Control points of a B-spline that starts exactly at the first and ends exactly at the last keyframe.
 
     The keyframes are the inner control points; before the first and after the last one stand
-    `ceil((order - 2) / 2)` phantom points ([H18] section 3): the neighbours mirrored in the end keyframe. Above
-    order 4 that is exact on commutative groups only; elsewhere the innermost phantom point is corrected until the
-    end pose is met to rounding.
+    `ceil((order - 2) / 2)` phantom points ([H18] section 3): the neighbours `Y` of the end keyframe `X` mirrored in
+    it, `X Y^-1 X`. With an odd order the domain ends halfway between two control points, and the end keyframe itself
+    comes twice. In the cumulative product of [S20] (23) the factors of mirrored neighbours cancel from the inside
+    out, so this is exact on every group and for every order.
 
     Args:
-        keyframes: `(*batch, M, P)`, M >= max(2, order - 2).
+        keyframes: `(*batch, M, P)`, M >= max(2, order // 2).
     Returns:
         `(*batch, M + 2 ceil((order - 2) / 2), P)`. An even order then spans M - 1 knot intervals from keyframe to
         keyframe, an odd one M.
+    Differentiable in keyframes, to any order.
     """
     _check_group(group)
     checks.whole("order", order, least=2)
-    pad = (order - 1) // 2
-    checks.points("keyframes", keyframes, group, least=max(2, order - 2))
-    if pad == 0:
-        return keyframes
-    front = _phantoms(keyframes[..., : pad + 1, :], group, order, at_end=False)
-    back = _phantoms(keyframes[..., -pad - 1 :, :], group, order, at_end=True)
-    return torch.cat([front, keyframes, back], dim=-2)
+    checks.points("keyframes", keyframes, group, least=max(2, order // 2))
+    mirrored = order // 2 - 1
+    first, last = keyframes[..., :1, :], keyframes[..., -1:, :]
+    front = _mirror(first, keyframes[..., 1 : 1 + mirrored, :], group)
+    back = _mirror(last, keyframes[..., -1 - mirrored : -1, :], group)
+    inner = [keyframes] if order % 2 == 0 else [first, keyframes, last]
+    return torch.cat([front, *inner, back], dim=-2)
 
 
-def _phantoms(near: Tensor, group: Group, order: int, at_end: bool) -> Tensor:
-    """Phantom points before the first, or after the last, of the `pad + 1` points `near`, in order of time.
-
-    A B-spline on a non-commutative group does not read the same backwards, so both ends are treated as they are.
-    """
-    pad = near.shape[-2] - 1
-    corner = near[..., -1:, :] if at_end else near[..., :1, :]
-    others = near[..., :-1, :] if at_end else near[..., 1:, :]
-    mirrored = group.compose(corner, group.inverse(group.between(corner, others))).flip(-2)
-    if order % 2 == 1:
-        # The domain begins and ends halfway between a phantom point and the keyframe: what is mirrored there is the
-        # keyframe itself first.
-        mirrored = torch.cat(
-            [corner, mirrored[..., :-1, :]] if at_end else [mirrored[..., 1:, :], corner], dim=-2
-        )
-    if order <= 4:
-        return mirrored  # one point twice, or three points on one geodesic: already exact
-    points = torch.cat([near, mirrored] if at_end else [mirrored, near], dim=-2)
-    if points.shape[-2] < order:  # an even order: the far control point has no weight at the end
-        far = points[..., :1, :] if at_end else points[..., -1:, :]
-        points = torch.cat([far, points] if at_end else [points, far], dim=-2)
-    inner = order - pad if at_end else pad - 1
-    weight = float(blending_matrix(order)[pad - 1][0])
-    index = torch.zeros(1, dtype=torch.int64, device=near.device)
-    u = torch.full((1,), float(at_end), dtype=near.dtype, device=near.device)
-    for _ in range(_CORRECTIONS):
-        met = cumulative_bspline(points, u, index, group.name, order, 0)[0]
-        miss = group.log(group.between(met, corner))
-        moved = group.retract(points[..., inner : inner + 1, :], miss / weight, side="right")
-        points = torch.cat([points[..., :inner, :], moved, points[..., inner + 1 :, :]], dim=-2)
-    return points[..., -pad:, :] if at_end else points[..., :pad, :]
+def _mirror(centre: Tensor, points: Tensor, group: Group) -> Tensor:
+    """`centre points^-1 centre`, in the opposite order."""
+    return group.compose(centre, group.between(points, centre)).flip(-2)
 
 
 def initial_control_points(
