@@ -96,8 +96,7 @@ class Group:
 
     def exp(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
         """Exp: tangents `(..., tangent_size)` to points, [S20] (1). Any angle; smooth everywhere."""
-        self._accept(validate, tangent=(tangent, "tangent"))
-        return run("exp", self.name, tangent)
+        return self._operate("exp", validate, tangent=(tangent, "tangent"))
 
     def log(self, point: Tensor, *, validate: bool = True) -> Tensor:
         """Log: the shortest tangent whose `exp` is the point, [S20] (2).
@@ -105,26 +104,22 @@ class Group:
         At a rotation by exactly pi both ways round are as short; the first non-zero component is then positive,
         and the gradient is that of this side.
         """
-        self._accept(validate, point=(point, "point"))
-        return run("log", self.name, point)
+        return self._operate("log", validate, point=(point, "point"))
 
     def compose(self, left: Tensor, right: Tensor, *, validate: bool = True) -> Tensor:
         """The product `left right`: with poses, first `right` then `left` acts on a point."""
-        self._accept(validate, left=(left, "point"), right=(right, "point"))
-        return run("compose", self.name, left, right)
+        return self._operate("compose", validate, left=(left, "point"), right=(right, "point"))
 
     def inverse(self, point: Tensor, *, validate: bool = True) -> Tensor:
         """The inverse element."""
-        self._accept(validate, point=(point, "point"))
-        return run("inverse", self.name, point)
+        return self._operate("inverse", validate, point=(point, "point"))
 
     def act(self, point: Tensor, vector: Tensor, *, validate: bool = True) -> Tensor:
         """`point` applied to vectors `(..., act_size)`: SO3 rotates, SE3 rotates and shifts, R^n shifts.
 
         A direct product acts on the vectors of its factors side by side: `R3xSO3` takes six numbers.
         """
-        self._accept(validate, point=(point, "point"), vector=(vector, "vector"))
-        return run("act", self.name, point, vector)
+        return self._operate("act", validate, point=(point, "point"), vector=(vector, "vector"))
 
     def interpolate(self, start: Tensor, end: Tensor, s: Tensor | float, *, validate: bool = True) -> Tensor:
         """The geodesic `start Exp(s Log(start^-1 end))`, [H18] (14); beyond 0 and 1 it goes on.
@@ -227,6 +222,11 @@ class Group:
         unit_vectors = unit_vectors.expand(*like.shape[:-1], size, size)
         return join(linear(split(unit_vectors)), unit_vectors).mT
 
+    def _operate(self, operation: str, validate: bool, **arguments: tuple[Tensor, str]) -> Tensor:
+        self._accept(False, **arguments)
+        check = (lambda: self._check_values(arguments)) if validate else None
+        return run(operation, self.name, *(x for x, _ in arguments.values()), check=check)
+
     def _accept(self, validate: bool, **arguments: tuple[Tensor, str]) -> None:
         """Check type, dtype, shape, device and, unless told not to, values of the named arguments."""
         sizes = {
@@ -239,8 +239,10 @@ class Group:
             checks.has_last(name, x, *sizes[kind])
         checks.same_kind(**{name: x for name, (x, _) in arguments.items()})
         checks.broadcast(**{name: x.shape[:-1] for name, (x, _) in arguments.items()})
-        if not validate:
-            return
+        if validate:
+            self._check_values(arguments)
+
+    def _check_values(self, arguments: dict[str, tuple[Tensor, str]]) -> None:
         for name, (x, kind) in arguments.items():
             checks.finite(name, x)
             if kind == "point":

@@ -6,6 +6,9 @@ they consist of plain differentiable arithmetic.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cache, reduce
+from operator import and_
 from typing import Any
 
 import torch
@@ -15,15 +18,26 @@ from torch.autograd import Function
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.recurrence import Step, forward, reverse, tangent
 from torchspline.arithmetic.registry import arithmetic
+from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, add, negate, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.nested import outer_levels, primals
+from torchspline.kernels.mode import RefusedError, batched, flat, transformed, usable
+from torchspline.kernels.programs import finite, valid_point
+from torchspline.kernels.rowwise import RowKernel
+from torchspline.kernels.trace import Symbol
+
+#: Fewest rows worth a kernel: a few tensor operations on less cost little, and compiling a kernel takes seconds once.
+FUSED_ROWS = 4096
 
 Arguments = tuple[Vector, ...]
 
 
 class Operation(ABC):
     """One operation on components. Points are stored numbers, quaternions of any length."""
+
+    #: What each argument is: "point", or anything else whose numbers only have to be finite.
+    kinds: tuple[str, ...]
 
     @abstractmethod
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
@@ -39,6 +53,8 @@ class Operation(ABC):
 
 
 class Exp(Operation):
+    kinds = ("tangent",)
+
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         (x,) = arguments
         return group.exp(x)
@@ -53,6 +69,8 @@ class Exp(Operation):
 
 
 class Log(Operation):
+    kinds = ("point",)
+
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         (stored,) = arguments
         return group.log(group.normalize(stored))
@@ -67,6 +85,8 @@ class Log(Operation):
 
 
 class Compose(Operation):
+    kinds = ("point", "point")
+
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         left, right = arguments
         return group.compose(group.normalize(left), group.normalize(right))
@@ -83,6 +103,8 @@ class Compose(Operation):
 
 
 class Inverse(Operation):
+    kinds = ("point",)
+
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         (stored,) = arguments
         return group.inverse(group.normalize(stored))
@@ -99,6 +121,8 @@ class Inverse(Operation):
 
 
 class Act(Operation):
+    kinds = ("point", "vector")
+
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         stored, point = arguments
         return group.act(group.normalize(stored), point)
@@ -116,6 +140,8 @@ class Act(Operation):
 
 class Interpolate(Operation):
     """The geodesic from `start` (s = 0) to `end` (s = 1): a cumulative product of one step, weight s."""
+
+    kinds = ("point", "point", "scalar")
 
     @staticmethod
     def _sweep(group: GroupArithmetic, arguments: Arguments) -> tuple[Vector, Vector, list[Step]]:
@@ -157,6 +183,11 @@ OPERATIONS: dict[str, Operation] = {
     "act": Act(),
     "interpolate": Interpolate(),
 }
+
+
+def _result_size(operation: str, group: str) -> int:
+    sizes = arithmetic(group)
+    return {"log": sizes.tangent_size, "act": sizes.act_size}.get(operation, sizes.point_size)
 
 
 def _forward(operation: str, group: str, *arguments: Tensor) -> Tensor:
@@ -216,9 +247,7 @@ def _compiled_reverse(operation: str, group: str, arguments: list[Tensor], cotan
 
 @_compiled.register_fake
 def _(operation: str, group: str, arguments: list[Tensor]) -> Tensor:
-    sizes = arithmetic(group)
-    size = {"log": sizes.tangent_size, "act": sizes.act_size}.get(operation, sizes.point_size)
-    return arguments[0].new_empty(*arguments[0].shape[:-1], size)
+    return arguments[0].new_empty(*arguments[0].shape[:-1], _result_size(operation, group))
 
 
 @_compiled_reverse.register_fake
@@ -238,14 +267,89 @@ def _compiled_backward(ctx: Any, cotangent: Tensor) -> tuple:
 _compiled.register_autograd(_compiled_backward, setup_context=_save)
 
 
-def run(operation: str, group: str, *arguments: Tensor) -> Tensor:
+def run(operation: str, group: str, *arguments: Tensor, check: Callable[[], None] | None = None) -> Tensor:
     """`operation` of `group`; all but the last dimension of the arguments broadcast.
 
-    Under `torch.compile` the operation is one opaque operator, since tracing through its arithmetic would take
-    the compiler minutes; everywhere else it is the autograd function, which also knows `jvp` and `vmap`.
+    Large tensors go through compiled kernels. Under `torch.compile` the operation is one opaque operator, since
+    tracing through its arithmetic would take the compiler minutes; everywhere else it is the autograd function, which
+    also knows `jvp` and `vmap`.
+
+    Args:
+        check: looks at the values of the arguments and raises; kernels look for themselves and call it if need be.
     """
     batch = torch.broadcast_shapes(*(x.shape[:-1] for x in arguments))
-    arguments = tuple(x.expand(*batch, x.shape[-1]) for x in arguments)
+    expanded = tuple(x.expand(*batch, x.shape[-1]) for x in arguments)
     if torch.compiler.is_compiling():
-        return _compiled(operation, group, list(arguments))
-    return GroupFunction.apply(operation, group, *arguments)
+        return _compiled(operation, group, list(expanded))
+    if batch.numel() >= FUSED_ROWS and usable(*arguments):
+        result = fused(operation, group, expanded, validate=check is not None)
+        if result is not None:
+            return result
+    if check is not None:
+        check()
+    return GroupFunction.apply(operation, group, *expanded)
+
+
+@cache
+def _kernels(
+    operation: str, group: str, sizes: tuple[int, ...], dtype: torch.dtype
+) -> tuple[RowKernel, RowKernel]:
+    """Forward and reverse of an operation; the forward refuses rows that the checks would."""
+    algebra, rules = arithmetic(group), OPERATIONS[operation]
+
+    def valid(*components: Vector) -> Symbol:
+        pairs = zip(rules.kinds, components, strict=True)
+        verdicts = [valid_point(algebra, x) if kind == "point" else finite(x) for kind, x in pairs]
+        return reduce(and_, verdicts)
+
+    def forward(*components: Vector) -> Vector:
+        return rules.forward(algebra, components)
+
+    def backward(*components: Vector) -> list[Scalar]:
+        gradients = rules.reverse(algebra, components[:-1], components[-1])
+        return [c for gradient in gradients for c in gradient]
+
+    result = _result_size(operation, group)
+    name = f"{operation}_{group}"
+    return (
+        RowKernel(name, forward, sizes, [result], dtype, valid),
+        RowKernel(f"{name}_reverse", backward, [*sizes, result], sizes, dtype),
+    )
+
+
+class FusedGroupFunction(Function):
+    """`GroupFunction` through compiled kernels."""
+
+    @staticmethod
+    def forward(ctx: Any, operation: str, group: str, validate: bool, *arguments: Tensor) -> Tensor:
+        first = arguments[0]
+        sizes = tuple(x.shape[-1] for x in arguments)
+        ctx.operation, ctx.group, ctx.kernels = (
+            operation,
+            group,
+            _kernels(operation, group, sizes, first.dtype),
+        )
+        result = first.new_empty(*first.shape[:-1], _result_size(operation, group))
+        refused = ctx.kernels[0](list(map(flat, arguments)), [flat(result)], first.shape[:-1].numel())
+        if refused and validate:
+            raise RefusedError
+        ctx.save_for_backward(*arguments)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        arguments = ctx.saved_tensors
+        if torch.is_grad_enabled() or transformed() or batched(cotangent):
+            return None, None, None, *_reverse(ctx.operation, ctx.group, arguments, cotangent)
+        gradients = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in arguments]
+        rows = cotangent.shape[:-1].numel()
+        ctx.kernels[1]([*map(flat, arguments), flat(cotangent)], list(map(flat, gradients)), rows)
+        return None, None, None, *gradients
+
+
+def fused(operation: str, group: str, arguments: tuple[Tensor, ...], validate: bool) -> Tensor | None:
+    """The result, or None if a value is not acceptable."""
+    try:
+        return FusedGroupFunction.apply(operation, group, validate, *arguments)
+    except RefusedError:
+        return None

@@ -43,7 +43,7 @@ def _middle(program: Trace, single: bool) -> list[str]:
 def _source(
     name: str, parameters: list[str], program: Trace, dtype: torch.dtype, parts: dict[str, list[str]]
 ) -> str:
-    """One function: `before` the blocks, `gather`, the arithmetic, `scatter`, and `after`."""
+    """One function: `before` the blocks, `gather`, the arithmetic, `again`, `scatter`, `after`."""
     single = dtype == torch.float32
     outputs = max(len(program.outputs), 1)
     lines = [
@@ -56,6 +56,7 @@ def _source(
         "        for i in range(n):",
         *(f"            {line}" for line in parts["gather"]),
         *(f"        {line}" for line in _middle(program, single)),
+        *(f"        {line}" for line in parts.get("again", [])),
         "        for i in range(n):",
         *(f"            {line}" for line in parts["scatter"]),
         *(f"    {line}" for line in parts.get("after", [])),
@@ -64,8 +65,14 @@ def _source(
     return "\n".join([_HEADER.format(real=real), "", _DECORATOR, *lines, ""])
 
 
-def emit_map(name: str, program: Trace, sizes: list[int], results: list[int], dtype: torch.dtype) -> str:
-    """`name(in0, ..., out0, ..., begin, stop)`: row r of every output from row r of every input, flat arrays."""
+def emit_rows(
+    name: str, near: Trace, far: Trace | None, sizes: list[int], results: list[int], dtype: torch.dtype
+) -> str:
+    """`name(in0, ..., out0, ..., begin, stop)`: row r of every output from row r of every input, flat arrays.
+
+    The last output of the programs is 1 for rows to refuse; how many is returned. A block in which the near program
+    does not hold for some row is done again by the far one.
+    """
     ins, outs = [f"in{i}" for i in range(len(sizes))], [f"out{i}" for i in range(len(results))]
     gather, row = [], 0
     for array, size in zip(ins, sizes, strict=True):
@@ -75,9 +82,25 @@ def emit_map(name: str, program: Trace, sizes: list[int], results: list[int], dt
     for array, size in zip(outs, results, strict=True):
         scatter += [f"{array}[(block + i) * {size} + {c}] = Y[{(row + c) * BLOCK} + i]" for c in range(size)]
         row += size
-    return _source(
-        name, [*ins, *outs, "begin", "stop"], program, dtype, {"gather": gather, "scatter": scatter}
-    )
+    scatter.append(f"refused += Y[{row * BLOCK} + i] != 0.0")
+    again = []
+    if far is not None:
+        guard = len(near.outputs) - 1
+        again = [
+            "beyond = False",
+            "for i in range(n):",
+            f"    beyond |= Y[{guard * BLOCK} + i] != 0.0",
+            "if beyond:",
+            *(f"    {line}" for line in _middle(far, dtype == torch.float32)),
+        ]
+    parts = {
+        "before": ["refused = 0"],
+        "gather": gather,
+        "again": again,
+        "scatter": scatter,
+        "after": ["return refused"],
+    }
+    return _source(name, [*ins, *outs, "begin", "stop"], near, dtype, parts)
 
 
 def emit_pairs(

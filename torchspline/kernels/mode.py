@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -62,3 +62,18 @@ def usable(*tensors: object) -> bool:
 def transformed() -> bool:
     """Whether `torch.func` or forward mode is at work: those need operations they can see."""
     return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+
+
+class RefusedError(Exception):
+    """A kernel met a value that is not acceptable; the reference's checks say which."""
+
+
+def batched(x: Tensor | None) -> bool:
+    """Whether `x` is a batch in disguise (`vmap`, `is_grads_batched`) rather than numbers in memory."""
+    functorch = torch._C._functorch
+    return x is not None and (functorch.is_batchedtensor(x) or functorch.is_legacy_batchedtensor(x))
+
+
+def flat(x: Tensor) -> Any:
+    """Its numbers as a flat array, without a copy if they lie in order."""
+    return x.detach().contiguous().numpy().reshape(-1)

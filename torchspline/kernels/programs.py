@@ -10,7 +10,7 @@ from torchspline.arithmetic.recurrence import forward, reverse
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, dot, negate, plus, scale, times
 from torchspline.checks import LONGEST_QUATERNION, SHORTEST_QUATERNION
-from torchspline.kernels.trace import Symbol, Trace, trace
+from torchspline.kernels.trace import Symbol, Trace, indicator, trace
 
 RationalRows = Sequence[Sequence[Fraction]]
 
@@ -87,39 +87,32 @@ def pairs_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
     def run(a: Vector, b: Vector) -> list[Scalar]:
         unit = group.normalize(a)
         between = group.between(unit, group.normalize(b))
-        flips = [_indicator(flip) for flip in group.long_way(between)]
-        return [*unit, *group.log(between), *flips, 1.0 - _indicator(_valid(group, a))]
+        flips = [indicator(flip) for flip in group.long_way(between)]
+        return [*unit, *group.log(between), *flips, 1.0 - indicator(valid_point(group, a))]
 
     return trace(run, [group.point_size, group.point_size], dtype)
 
 
-def _indicator(condition: Symbol) -> Symbol:
-    return condition.graph.record("where", condition, 1.0, 0.0)
+def finite(numbers: Vector) -> Symbol:
+    """Whether all numbers are finite."""
+    difference = numbers[0] - numbers[0]  # 0, or not a number if that is infinite or not a number
+    for x in numbers[1:]:
+        difference = difference + (x - x)
+    return difference == 0.0
 
 
-def _valid(group: GroupArithmetic, stored: Vector) -> Symbol:
-    difference: Scalar = 0.0
-    for x in stored:
-        difference = difference + (x - x)  # 0, or not a number if x is infinite or not a number
-    valid = difference == 0.0
+def valid_point(group: GroupArithmetic, stored: Vector) -> Symbol:
+    """Whether stored numbers are a point: finite, quaternions of a length that can be divided by."""
+    valid = finite(stored)
     shortest, longest = (SHORTEST_QUATERNION * 0.999) ** 2, (LONGEST_QUATERNION * 1.001) ** 2
     for start, stop in group.sign_blocks:
         squared = dot(stored[start:stop], stored[start:stop])
-        valid = valid & (squared > shortest) & (squared < longest)
+        valid = valid & (-squared < -shortest) & (squared < longest)  # `>` would be a far path, see `trace`
     return valid
 
 
-def pairs_reverse_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
-    """Inputs the logarithm of a pair and its cotangent; outputs body cotangents of second and first."""
-
-    def run(d: Vector, g: Vector) -> list[Scalar]:
-        second = group.right_jacobian_inverse_transpose(d, g, short=True)
-        first = negate(group.left_jacobian_inverse_transpose(d, g, short=True))
-        return [*second, *first]
-
-    return trace(run, [group.tangent_size] * 2, dtype)
-
-
-def embed_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:
-    """Inputs stored numbers and a body cotangent; outputs the Euclidean gradient."""
-    return trace(lambda stored, g: group.embed(stored, g), [group.point_size, group.tangent_size], dtype)
+def pairs_reverse(group: GroupArithmetic, d: Vector, g: Vector) -> list[Scalar]:
+    """Body cotangents of second and first of a pair, from its logarithm and the cotangent of that."""
+    second = group.right_jacobian_inverse_transpose(d, g, short=True)
+    first = negate(group.left_jacobian_inverse_transpose(d, g, short=True))
+    return [*second, *first]

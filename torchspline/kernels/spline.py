@@ -7,18 +7,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.kernels import emit, programs
 from torchspline.kernels.build import compiled
+from torchspline.kernels.rowwise import Array, RowKernel
 from torchspline.kernels.threads import SERIAL_BELOW, run, spans
-
-Array = NDArray[Any]
 
 #: Queries a chunk of the reverse sweep. Chunks are summed in order whatever the number of threads, so that gradients
 #: are the same to the last bit.
@@ -155,12 +152,12 @@ class SplineKernels:
         """Through the logarithms of neighbours to body cotangents, and from those to stored numbers."""
         points = clock.trajectories * clock.points
         second, first = np.empty(points * D, self.real), np.empty(points * D, self.real)
-        self._pairs_reverse(pairs.logs, logs_g, second, first, 0, points)
+        self._pairs_reverse([pairs.logs, logs_g], [second, first], points)
         body = start_g.reshape(clock.trajectories, clock.points, D)
         for here, share in ((body[:, 1:], second), (body[:, :-1], first)):
             np.add(here, share.reshape(body.shape)[:, :-1], out=here)
         gradient = np.empty(points * P, self.real)
-        self._embed(stored, start_g, gradient, 0, points)
+        self._embed([stored, start_g], [gradient], points)
         return gradient
 
     def _scale(self, clock: Clock) -> Array:
@@ -186,11 +183,6 @@ class SplineKernels:
     def _name(self, kind: str) -> str:
         return f"{kind}_{self.group.name}_k{self.order}_d{self.derivatives}_{self.real.__name__}"
 
-    def _map(self, kind: str, program: programs.Trace, sizes: list[int], results: list[int]) -> Callable:
-        name = f"{kind}_{self.group.name}_{self.real.__name__}"
-        source = emit.emit_map(name, program, sizes, results, self.dtype)
-        return compiled(name, source, self._types("r" * (len(sizes) + len(results)), "ii"))
-
     @cached_property
     def _pairs(self) -> Callable:
         group, name = self.group, f"pairs_{self.group.name}_{self.real.__name__}"
@@ -201,16 +193,15 @@ class SplineKernels:
         return compiled(name, source, self._types("rirr", "ii"))
 
     @cached_property
-    def _pairs_reverse(self) -> Callable:
-        D = self.group.tangent_size
-        return self._map(
-            "pairs_reverse", programs.pairs_reverse_program(self.group, self.dtype), [D, D], [D, D]
-        )
+    def _pairs_reverse(self) -> RowKernel:
+        group, D = self.group, self.group.tangent_size
+        name = f"pairs_reverse_{group.name}"
+        return RowKernel(name, partial(programs.pairs_reverse, group), [D, D], [D, D], self.dtype)
 
     @cached_property
-    def _embed(self) -> Callable:
-        P, D = self.group.point_size, self.group.tangent_size
-        return self._map("embed", programs.embed_program(self.group, self.dtype), [P, D], [P])
+    def _embed(self) -> RowKernel:
+        group, P, D = self.group, self.group.point_size, self.group.tangent_size
+        return RowKernel(f"embed_{group.name}", group.embed, [P, D], [P], self.dtype)
 
     @cached_property
     def _forward(self) -> Callable:

@@ -44,8 +44,10 @@ class Operation(NamedTuple):
 class Graph:
     """All operations of a trace in order; a `Symbol` is a position in it."""
 
-    def __init__(self, dtype: torch.dtype):
+    def __init__(self, dtype: torch.dtype, near: bool = False):
         self.dtype = dtype
+        #: Whether `x > constant` is taken to be False; what was assumed is kept, so that it can be tested for.
+        self.near, self.assumed = near, list[Symbol]()
         self.operations: list[Operation] = []
         self._numbers: dict[Operation, int] = {}
 
@@ -139,8 +141,12 @@ class Symbol:
     def __lt__(self, other: "Symbol | float") -> "Symbol":
         return self.graph.record("lt", self, other)
 
-    def __gt__(self, other: "Symbol | float") -> "Symbol":
-        return self.graph.record("gt", self, other)
+    def __gt__(self, other: "Symbol | float") -> "Symbol | bool":  # type: ignore[misc]
+        exceeds = self.graph.record("gt", self, other)
+        if self.graph.near and not isinstance(other, Symbol):
+            self.graph.assumed.append(exceeds)
+            return False
+        return exceeds
 
     def __eq__(self, other: object) -> "Symbol":  # type: ignore[override]
         assert isinstance(other, (Symbol, float, int))
@@ -152,11 +158,20 @@ class Symbol:
     def __or__(self, other: "Symbol") -> "Symbol":
         return self.graph.record("or", self, other)
 
+    def __bool__(self) -> bool:
+        raise TypeError("a number being traced has no truth value: choose with `where` instead of `if`")
+
     __hash__ = None  # type: ignore[assignment]
 
 
 def _is(x: object, constant: float) -> bool:
     return isinstance(x, (int, float)) and x == constant
+
+
+def _where(condition: "Symbol | bool", yes: "Symbol | float", no: "Symbol | float") -> "Symbol | float":
+    if isinstance(condition, bool):
+        return yes if condition else no
+    return condition.graph.record("where", condition, yes, no)
 
 
 namespace.register(
@@ -165,9 +180,14 @@ namespace.register(
         sqrt=lambda x: x.graph.record("sqrt", x),
         sin=lambda x: x.graph.record("sin", x),
         cos=lambda x: x.graph.record("cos", x),
-        where=lambda condition, yes, no: condition.graph.record("where", condition, yes, no),
+        where=_where,
     ),
 )
+
+
+def indicator(condition: Symbol) -> Symbol:
+    """1 where the condition holds, else 0."""
+    return condition.graph.record("where", condition, 1.0, 0.0)
 
 
 class Trace(NamedTuple):
@@ -177,6 +197,8 @@ class Trace(NamedTuple):
     operations: list[tuple[int, Operation]]
     #: Number of a value, or a constant, for each output.
     outputs: list[tuple[str, int | str]]
+    #: Whether the last output is 1 where the trace does not hold, because a number was larger than assumed.
+    guarded: bool = False
 
     def lines(
         self, load: Callable[[int], str], constant: Callable[[float], str]
@@ -207,14 +229,27 @@ class Trace(NamedTuple):
         return totals
 
 
-def trace(function: Callable[..., Sequence], sizes: Sequence[int], dtype: torch.dtype) -> Trace:
-    """Run `function` on tuples of symbols of the given sizes; it returns the outputs as one flat sequence."""
-    graph = Graph(dtype)
+def trace(
+    function: Callable[..., Sequence], sizes: Sequence[int], dtype: torch.dtype, near: bool = False
+) -> Trace:
+    """Run `function` on tuples of symbols of the given sizes; it returns the outputs as one flat sequence.
+
+    Args:
+        near: follow the side of every `x > constant` on which x is small, and add an output that says where that was
+            wrong; range reductions then leave no trace.
+    """
+    graph = Graph(dtype, near)
     arguments, first = [], 0
     for size in sizes:
         arguments.append(graph.inputs(size, first))
         first += size
-    results = function(*arguments)
+    results = list(function(*arguments))
+    guarded = len(graph.assumed) > 0
+    if guarded:
+        wrong = graph.assumed[0]
+        for exceeds in graph.assumed[1:]:
+            wrong = wrong | exceeds
+        results.append(indicator(wrong))
     outputs: list[tuple[str, int | str]] = [
         ("v", x.number) if isinstance(x, Symbol) else ("c", float(x).hex()) for x in results
     ]
@@ -229,4 +264,4 @@ def trace(function: Callable[..., Sequence], sizes: Sequence[int], dtype: torch.
         if kind != "input":
             waiting += [operand[1] for operand in operands if operand[0] == "v"]
     kept = [(n, graph.operations[n]) for n in sorted(needed)]
-    return Trace(first, kept, outputs)
+    return Trace(first, kept, outputs, guarded)

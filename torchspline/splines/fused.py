@@ -9,14 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from torchspline.kernels.mode import transformed
+from torchspline.kernels.mode import RefusedError, batched, flat, transformed
 from torchspline.kernels.spline import Clock, Pairs, SplineKernels
 from torchspline.splines.basis import cumulative_matrix
 from torchspline.splines.clock import tolerance
-
-
-class RefusedError(Exception):
-    """A control point is not a point or a time lies outside the domain; the reference's checks say which."""
 
 
 @dataclass
@@ -36,7 +32,7 @@ class Call:
     def clock(self, control_points: Tensor, t: Tensor) -> Clock:
         trajectories = control_points.shape[:-2].numel()
         return Clock(
-            _flat(t),
+            flat(t),
             t.ndim == 1,
             self.t0,
             self.dt,
@@ -88,10 +84,6 @@ def kernels_of(
     return SplineKernels(group, cumulative_matrix(order)[1:], derivatives, dtype, nanoseconds)
 
 
-def _flat(x: Tensor):
-    return x.detach().contiguous().numpy().reshape(-1)
-
-
 class FusedBSpline(Function):
     """Value and rates per second of control points `(*batch, M, P)` at `t` `(N,)` or `(*batch, N)`.
 
@@ -105,12 +97,12 @@ class FusedBSpline(Function):
         group = call.kernels.group
         batch = control_points.shape[:-2]
         clock = call.clock(control_points, t)
-        call.pairs, bad = call.kernels.pairs(_flat(control_points), clock.trajectories, clock.points)
+        call.pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
         if bad and call.tolerance is not None:
             raise RefusedError
         sizes = [group.point_size, *[group.tangent_size] * call.kernels.derivatives]
         outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
-        outside = call.kernels.forward(call.pairs, clock, [_flat(x) for x in outputs])
+        outside = call.kernels.forward(call.pairs, clock, [flat(x) for x in outputs])
         if outside:
             raise RefusedError
         ctx.call = call
@@ -122,14 +114,12 @@ class FusedBSpline(Function):
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         control_points, t, t0, dt, *outputs = ctx.saved_tensors
         call: Call = ctx.call
-        if torch.is_grad_enabled() or transformed() or not all(map(_plain, cotangents)):
+        if torch.is_grad_enabled() or transformed() or any(map(batched, cotangents)):
             return *_through_reference(call, (control_points, t, t0, dt), cotangents), None
         filled = [torch.zeros_like(x) if c is None else c for c, x in zip(cotangents, outputs, strict=True)]
         clock = call.clock(control_points, t)
-        value, value_g, *rates_g = map(_flat, (outputs[0], *filled))
-        stored_g, u_g = call.kernels.reverse(
-            _flat(control_points), call.pairs, clock, value, value_g, rates_g
-        )
+        value, value_g, *rates_g = map(flat, (outputs[0], *filled))
+        stored_g, u_g = call.kernels.reverse(flat(control_points), call.pairs, clock, value, value_g, rates_g)
         t_g = None
         if any(ctx.needs_input_grad[1:4]):
             t_g = torch.from_numpy(u_g).reshape(outputs[0].shape[:-1]).to(torch.float64) / call.dt
@@ -144,12 +134,6 @@ class FusedBSpline(Function):
         if t_g is not None:
             t_g = t_g.sum_to_size(t.shape) if ctx.needs_input_grad[1] else None
         return torch.from_numpy(stored_g).reshape(control_points.shape), t_g, t0_g, dt_g, None
-
-
-def _plain(x: Tensor | None) -> bool:
-    """Whether a cotangent is numbers in memory rather than a batch in disguise (`is_grads_batched`)."""
-    functorch = torch._C._functorch
-    return x is None or not (functorch.is_batchedtensor(x) or functorch.is_legacy_batchedtensor(x))
 
 
 def _through_reference(
