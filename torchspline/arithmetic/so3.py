@@ -149,10 +149,13 @@ class SO3(AdjointSeriesGroup):
         return multiply_pure(X, scale(0.5, v))
 
     def embed(self, stored: Vector, g: Vector) -> Vector:
-        return multiply_pure(stored, scale(2.0 / dot(stored, stored), g))
+        # By the length twice rather than by its square, whose derivative leaves the range of float32 early.
+        reciprocal = 1.0 / sqrt(dot(stored, stored))
+        return multiply_pure(scale(reciprocal, stored), scale(2.0 * reciprocal, g))
 
     def extract(self, stored: Vector, rate: Vector) -> Vector:
-        return scale(2.0 / dot(stored, stored), multiply(conjugate(stored), rate)[1:])
+        reciprocal = 1.0 / sqrt(dot(stored, stored))
+        return scale(2.0 * reciprocal, multiply(conjugate(scale(reciprocal, stored)), rate)[1:])
 
     def to_matrix(self, X: Vector) -> Matrix:
         w, x, y, z = X
