@@ -83,6 +83,16 @@ def test_gravity_and_a_gap(tmp_path: Path) -> None:
         torch.testing.assert_close(accelerometer, expected.expand_as(accelerometer), atol=1e-6, rtol=0)
 
 
+def test_kernels_show_prints_a_loop() -> None:
+    done = torchspline(
+        "kernels", "show", "SO3", "--order", "3", "--sweep", "reverse", "--precision", "float32"
+    )
+    assert done.returncode == 0, done.stderr
+    compile(done.stdout, "shown", "exec")
+    assert "def reverse_SO3_k3_d2_float32(" in done.stdout
+    assert "real = np.float32" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -94,13 +104,15 @@ def test_gravity_and_a_gap(tmp_path: Path) -> None:
         (("imu", "{poses}", "--start", "1e3"), "nothing is left of the longest stretch"),
         (("imu", "{poses}", "--recorded", "{early}"), "has no reading between"),
         (("imu", "{poses}", "--order", "1"), "order: expected a whole number of at least 2, got 1"),
+        (("kernels", "show", "SO9"), "no group is called 'SO9'"),
     ],
 )
 def test_mistakes_are_explained(demo: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     early = tmp_path / "early.csv"
     early.write_text("#timestamp [ns],wx,wy,wz,ax,ay,az\n-9000000000,0,0,0,0,0,9.8\n")
     places = {"poses": demo / "poses.txt", "early": early}
-    done = torchspline(*(a.format(**places) for a in arguments), "--out", tmp_path / "out")
+    where = [] if arguments[0] == "kernels" else ["--out", tmp_path / "out"]
+    done = torchspline(*(a.format(**places) for a in arguments), *where)
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr

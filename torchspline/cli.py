@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo` and `torchspline imu`."""
+"""The command line: `torchspline demo`, `torchspline imu`, `torchspline kernels show`."""
 
 import json
 import math
@@ -13,11 +13,12 @@ from rich.table import Table
 from torch import Tensor
 
 from torchspline.fit import PoseFit, fit_poses
-from torchspline.groups import SO3
+from torchspline.groups import SO3, Group
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline, Trajectory
+from torchspline.splines.fused import kernels_of
 
 _NS = 1_000_000_000
 _console = Console()
@@ -199,6 +200,27 @@ def imu(
     return 0
 
 
+def show(
+    group: str,
+    order: int = 4,
+    derivatives: int = 2,
+    sweep: Literal["forward", "reverse"] = "forward",
+    precision: Literal["float64", "float32"] = "float64",
+) -> int:
+    """Print the source of the compiled loop that evaluates a spline.
+
+    Args:
+        group: name of the group, such as SO3, SE3, R3 or R3xSO3.
+        order: of the spline.
+        derivatives: how many time derivatives, 0 to 3.
+        sweep: the values, or the gradients.
+        precision: of the numbers.
+    """
+    kernels = kernels_of(Group(group).name, order, derivatives, getattr(torch, precision), nanoseconds=False)
+    print(kernels.forward_source() if sweep == "forward" else kernels.reverse_source())
+    return 0
+
+
 def _random_motion(duration: float, generator: torch.Generator) -> SplitBSpline:
     """A smooth motion about 1 m across with turns of about a radian a second, on nanosecond stamps."""
     knot, order = 0.5, 6
@@ -309,7 +331,7 @@ def main() -> None:
     from jsonargparse import CLI
 
     try:
-        status = CLI({"demo": demo, "imu": imu}, prog="torchspline")
+        status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
     except (ValueError, OSError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 FloatArray = NDArray[np.float64]
 
@@ -51,8 +50,12 @@ class BandedCholesky:
     """Factor of a positive definite matrix given by its lower band."""
 
     def __init__(self, band: FloatArray):
+        from scipy.linalg import cholesky_banded  # as long to import as the rest of the library
+
         self._factor = cholesky_banded(band, lower=True, check_finite=False)
 
     def solve(self, right_side: FloatArray) -> FloatArray:
         """Solution for one right side (count,) or several as columns (count, C)."""
+        from scipy.linalg import cho_solve_banded
+
         return cho_solve_banded((self._factor, True), right_side, check_finite=False)

@@ -51,8 +51,10 @@ class Clock:
             return everything
         offset = first * self.queries if self.shared else 0
         times = self.times[begin - offset : stop - offset]
-        low, high = ((float(t) - self.t0) / self.dt for t in (times.min(), times.max()))
-        if not np.isfinite(low + high):
+        # Whole nanoseconds as Python's numbers: in float64 an epoch is off by more than a short spacing.
+        elapsed = [t.item() - self.t0 for t in (times.min(), times.max())]
+        low, high = (x / self.dt for x in elapsed)
+        if not np.isfinite(low + high) or (times.dtype == np.int64 and max(map(abs, elapsed)) >= 2**63):
             return everything
         start = min(max(int(low) - 1, 0), self.segments - 1)
         end = min(max(int(high) + 2, 1), self.segments) + order - 1
@@ -82,6 +84,8 @@ class SplineKernels:
         self.dtype, self.nanoseconds = dtype, nanoseconds
         self.real = np.float32 if dtype == torch.float32 else np.float64
         self.order = len(rows) + 1
+        #: Components of the value and of each rate.
+        self.result_sizes = [self.group.point_size, *[self.group.tangent_size] * derivatives]
 
     # ------------------------------------------------------------------ forward
 

@@ -20,12 +20,12 @@ class _Pool:
         self.size = 0
 
     def get(self, size: int) -> ThreadPoolExecutor:
-        if self.executor is None or self.size < size:
-            old, self.executor = self.executor, ThreadPoolExecutor(size, thread_name_prefix="torchspline")
-            self.size = size
-            if old is not None:
-                old.shutdown(wait=False)
-        return self.executor
+        executor = self.executor
+        if executor is None or self.size < size:
+            # A smaller one is left to whoever is about to use it; its threads end when nobody holds it any more.
+            executor = ThreadPoolExecutor(size, thread_name_prefix="torchspline")
+            self.executor, self.size = executor, size
+        return executor
 
     def forget(self) -> None:
         """The child of a fork has none of its parent's threads."""

@@ -94,41 +94,48 @@ class FusedBSpline(Function):
     def forward(
         ctx: Any, control_points: Tensor, t: Tensor, t0: Tensor | None, dt: Tensor | None, call: Call
     ) -> tuple[Tensor, ...]:
-        group = call.kernels.group
         batch = control_points.shape[:-2]
         clock = call.clock(control_points, t)
         call.pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
         if bad and call.tolerance is not None:
             raise RefusedError
-        sizes = [group.point_size, *[group.tangent_size] * call.kernels.derivatives]
+        sizes = call.kernels.result_sizes
         outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
         outside = call.kernels.forward(call.pairs, clock, [flat(x) for x in outputs])
         if outside:
             raise RefusedError
         ctx.call = call
-        ctx.save_for_backward(control_points, t, t0, dt, *outputs)
+        ctx.save_for_backward(control_points, t, t0, dt)
+        # Not saved for backward: there, writing to a result in place would be an error, which it is not elsewhere.
+        ctx.results = tuple(x.detach() for x in (outputs[:1] if dt is None else outputs))
         ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        control_points, t, t0, dt, *outputs = ctx.saved_tensors
+        control_points, t, t0, dt = ctx.saved_tensors
         call: Call = ctx.call
-        if torch.is_grad_enabled() or transformed() or any(map(batched, cotangents)):
+        results: tuple[Tensor, ...] = ctx.results
+        overwritten = any(x._version > 0 for x in results)
+        if overwritten or torch.is_grad_enabled() or transformed() or any(map(batched, cotangents)):
             return *_through_reference(call, (control_points, t, t0, dt), cotangents), None
-        filled = [torch.zeros_like(x) if c is None else c for c, x in zip(cotangents, outputs, strict=True)]
+        shape, sizes = results[0].shape[:-1], call.kernels.result_sizes
+        filled = [
+            control_points.new_zeros(*shape, size) if c is None else c
+            for c, size in zip(cotangents, sizes, strict=True)
+        ]
         clock = call.clock(control_points, t)
-        value, value_g, *rates_g = map(flat, (outputs[0], *filled))
+        value, value_g, *rates_g = map(flat, (results[0], *filled))
         stored_g, u_g = call.kernels.reverse(flat(control_points), call.pairs, clock, value, value_g, rates_g)
         t_g = None
         if any(ctx.needs_input_grad[1:4]):
-            t_g = torch.from_numpy(u_g).reshape(outputs[0].shape[:-1]).to(torch.float64) / call.dt
+            t_g = torch.from_numpy(u_g).reshape(shape).to(torch.float64) / call.dt
         t0_g = -t_g.sum() if t0 is not None and t_g is not None else None
         dt_g = None
         if dt is not None and t_g is not None:
             # u = (t - t0) / dt - segment, and the r-th rate carries a factor dt^-r.
             dt_g = -(t_g * (t - call.t0)).sum()
-            for r, (g, x) in enumerate(zip(filled, outputs, strict=True)):
+            for r, (g, x) in enumerate(zip(filled, results, strict=True)):
                 dt_g = dt_g - r * (g * x).sum(dtype=torch.float64)
             dt_g = dt_g / call.dt
         if t_g is not None:
@@ -142,10 +149,11 @@ def _through_reference(
     cotangents: tuple[Tensor | None, ...],
 ) -> list[Tensor | None]:
     """Gradients as differentiable operations: the reference run again on the saved tensors, whose graph it extends."""
-    wanted = [x for x in saved if x is not None and x.requires_grad]
     again = torch.is_grad_enabled()
     with torch.enable_grad():
-        control_points, t, t0, dt = saved
+        # Views, so that where one of these was computed from another no gradient passes from argument to argument.
+        control_points, t, t0, dt = (x if x is None or not x.requires_grad else x.view_as(x) for x in saved)
+        wanted = [x for x in (control_points, t, t0, dt) if x is not None and x.requires_grad]
         outputs = call.reference(
             control_points, t, call.t0 if t0 is None else t0, call.dt if dt is None else dt
         )
