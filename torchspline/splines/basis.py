@@ -5,7 +5,7 @@ time within a segment in units of the knot spacing.
 """
 
 from fractions import Fraction
-from functools import cache
+from functools import lru_cache
 from math import comb, factorial
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 RationalMatrix = tuple[tuple[Fraction, ...], ...]
 
 
-@cache
+@lru_cache(maxsize=None, typed=True)  # 4.0 equals 4, but is no order
 def blending_matrix(order: int) -> RationalMatrix:
     """M of [S20] (17)-(18), k x k: control point s of a segment has weight `sum_n M[s][n] u^n`.
 
@@ -32,7 +32,7 @@ def blending_matrix(order: int) -> RationalMatrix:
     return tuple(tuple(entry(s, n) for n in range(k)) for s in range(k))
 
 
-@cache
+@lru_cache(maxsize=None, typed=True)  # 4.0 equals 4, but is no order
 def cumulative_matrix(order: int) -> RationalMatrix:
     """The cumulative matrix of [S20] (19), k x k: row j is the sum of the blending rows from j on.
 
@@ -45,7 +45,7 @@ def cumulative_matrix(order: int) -> RationalMatrix:
     )
 
 
-@cache
+@lru_cache(maxsize=None, typed=True)  # 4.0 equals 4, but is no order
 def derivative_matrix(matrix: RationalMatrix, derivative: int) -> RationalMatrix:
     """The rows' polynomials differentiated; as many columns as before, the last ones zero."""
     for _ in range(derivative):

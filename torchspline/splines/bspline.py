@@ -82,7 +82,9 @@ def bspline(
         )
 
     fields = None
-    if extrapolate == "error" and usable(control_points, times, start, spacing):
+    # Asked first: Dynamo cannot trace the context variable that `usable` reads.
+    eager = not torch.compiler.is_compiling()
+    if eager and extrapolate == "error" and usable(control_points, times, start, spacing):
         kernels = kernels_of(group.name, order, derivatives, control_points.dtype, times.dtype == torch.int64)
         if validate:
             check_float32(times, spacing)

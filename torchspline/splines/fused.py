@@ -152,7 +152,8 @@ def _through_reference(
     again = torch.is_grad_enabled()
     with torch.enable_grad():
         # Views, so that where one of these was computed from another no gradient passes from argument to argument.
-        control_points, t, t0, dt = (x if x is None or not x.requires_grad else x.view_as(x) for x in saved)
+        control_points, t = (x.view_as(x) if x.requires_grad else x for x in saved[:2])
+        t0, dt = (x.view_as(x) if x is not None and x.requires_grad else x for x in saved[2:])
         wanted = [x for x in (control_points, t, t0, dt) if x is not None and x.requires_grad]
         outputs = call.reference(
             control_points, t, call.t0 if t0 is None else t0, call.dt if dt is None else dt
