@@ -1,9 +1,10 @@
 """A trajectory through timed poses, by least squares on the control points."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -11,7 +12,14 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.banded import BandedCholesky, FloatArray, difference_band, gram_band, transpose_apply
+from torchspline.fit.banded import (
+    BandedCholesky,
+    FloatArray,
+    NormalEquations,
+    difference_band,
+    gram_band,
+    transpose_apply,
+)
 from torchspline.groups.components import join, split
 from torchspline.groups.group import R3, SE3, SO3, Group, product
 from torchspline.splines.basis import blending_matrix
@@ -21,8 +29,8 @@ from torchspline.splines.keyframes import consistent_signs
 
 Representation = Literal["split", "joint"]
 _NANOSECONDS = 1_000_000_000
-#: Steps the quasi-Newton iteration remembers.
-_MEMORY = 10
+#: Rows of the Jacobian that are held at a time.
+_ROWS = 20_000
 
 
 @dataclass(frozen=True)
@@ -70,9 +78,8 @@ def fit_poses(
 ) -> PoseFit:
     """Least-squares B-spline through timed poses: `sum |Log(X(t_i)^-1 X_i)|^2_sigma` plus a little smoothness.
 
-    A banded linear fit of the stored numbers (exact for positions) starts L-BFGS with exact gradients from the
-    spline's reverse sweep, preconditioned by the banded Hessian of the same problem on R^n. Cost is linear in poses
-    and control points.
+    A banded linear fit of the stored numbers (exact for positions) starts Levenberg-Marquardt with exact Jacobians
+    from the spline's reverse sweep and a banded Cholesky factorisation. Cost is linear in poses and control points.
 
     Args:
         t: (N,) seconds (float64) or int64 nanoseconds; in any order, duplicates allowed.
@@ -137,7 +144,7 @@ def fit_poses(
     residual[1, rows.cpu()] = SO3.log(SO3.between(fitted[:, 3:], measured[:, 3:]))
     gaps = knots.gaps(times)
     dropped, duplicates = int((~usable).sum()), len(times) - distinct
-    notes = _notes(order_of_time, dropped, duplicates, gaps, len(times), knots)
+    notes = _notes(rows, dropped, duplicates, gaps, len(times), knots)
     return PoseFit(trajectory, residual[0], residual[1], dropped, duplicates, gaps, cost, reason, notes)
 
 
@@ -175,7 +182,11 @@ class _Knots:
         if self.dt == 0:
             raise ValueError(f"dt: with int64 times expected at least a nanosecond, got {dt} s")
         span = times[-1].item() - self.t0
-        segments = -(-span // self.dt) if self.nanoseconds else math.ceil(span / self.dt - 1e-9)
+        if self.nanoseconds:
+            segments = -(-span // self.dt)
+        else:  # rounding errors of the times beyond the last knot belong to the domain, see `locate`
+            rounding = np.finfo(np.float64).eps * (abs(times[-1].item()) + abs(self.t0) + span) / self.dt
+            segments = math.ceil(span / self.dt - min(3.0 * rounding, 1e-3))
         self.segments = max(int(segments), 1)
         self.count = self.segments + order - 1
 
@@ -194,7 +205,7 @@ class _Knots:
 
 
 class _Problem:
-    """Residuals of all poses, their gradient, and the banded matrix that turns a gradient into a step."""
+    """Residuals of all poses and of smoothness, and the normal equations of a step."""
 
     def __init__(
         self,
@@ -205,102 +216,128 @@ class _Problem:
         sigmas: tuple[float, float],
         smoothness: float,
     ):
-        self.group, self.knots, self.times, self.measured = group, knots, times, measured
+        self.group, self.knots, self.measured = group, knots, measured
         self.weight = torch.tensor([1 / sigmas[0]] * 3 + [1 / sigmas[1]] * 3, dtype=torch.float64)
-        order = knots.order
-        self.first, u = knots.place(times)
-        powers = u[:, None] ** np.arange(order)
-        self.basis: FloatArray = powers @ np.array(blending_matrix(order), dtype=np.float64).T
+        first, u = knots.place(times)
+        self.first, self.u = torch.from_numpy(first), torch.from_numpy(u)
         per_interval = len(times) / knots.segments
         self.smooth_weight = smoothness * per_interval
+        self.tiny = 1e-14 * per_interval  # keeps a single knot interval with few poses definite
         self.difference = min(2, knots.count - 1)
-        band = gram_band(self.basis, self.first, knots.count)
-        width = max(order, self.difference + 1)
-        band = np.vstack([band, np.zeros((width - order, knots.count))])
-        band += self.smooth_weight * difference_band(knots.count, self.difference, width)
-        band[0] += 1e-14 * per_interval  # keeps a single knot interval with few poses definite
-        self.factor = BandedCholesky(band)
 
     def start(self) -> Tensor:
         """The linear fit of the stored numbers, quaternions normalised after it."""
-        right = transpose_apply(self.basis, self.first, self.knots.count, self.measured.numpy())
-        solution = torch.from_numpy(self.factor.solve(right))
+        order, count = self.knots.order, self.knots.count
+        first, powers = self.first.numpy(), self.u.numpy()[:, None] ** np.arange(order)
+        basis: FloatArray = powers @ np.array(blending_matrix(order), dtype=np.float64).T
+        width = max(order, self.difference + 1)
+        band = self.smooth_weight * difference_band(count, self.difference, width)
+        band[:order] += gram_band(basis, first, count)
+        band[0] += self.tiny
+        right = transpose_apply(basis, first, count, self.measured.numpy())
+        solution = torch.from_numpy(BandedCholesky(band).solve(right))
         # Where rotation runs through more than half a turn between knots the numbers can cancel to nothing.
         vanished = solution[:, 3:].norm(dim=-1) < 1e-3
         solution[vanished, 3:] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
         return self.group.normalize(solution)
 
-    def cost(self, control_points: Tensor) -> Tensor:
+    def _parts(self, size: int) -> Iterator[tuple[Tensor, Callable[[Tensor], Tensor], int]]:
+        """The rows of the problem in parts of at most `size`: first control point, residuals of windows, their width.
+
+        A window is the control points that a row depends on; residuals are weighted, (rows, 6).
+        """
+        order = self.knots.order
+        for rows in torch.arange(len(self.u)).split(size):
+            yield self.first[rows], partial(self._misses, self.u[rows], self.measured[rows]), order
+        bends = torch.arange(self.knots.count - self.difference)
+        for rows in bends.split(size):
+            yield rows, self._bends, self.difference + 1
+
+    def _misses(self, u: Tensor, measured: Tensor, windows: Tensor) -> Tensor:
         fitted = bspline(
-            control_points,
-            self.times,
+            windows,
+            u[:, None],
             group=self.group,
             order=self.knots.order,
-            **self.knots.options(),
+            dt=1.0,
             derivatives=0,
             validate=False,
-        ).value  # fmt: skip
-        residual = self.group.log(self.group.between(fitted, self.measured, validate=False), validate=False)
-        total = (residual * self.weight).square().sum()
+        ).value[:, 0]
+        miss = self.group.log(self.group.between(fitted, measured, validate=False), validate=False)
+        return miss * self.weight
+
+    def _bends(self, windows: Tensor) -> Tensor:
         steps = self.group.log(
-            self.group.between(control_points[:-1], control_points[1:], validate=False), validate=False
+            self.group.between(windows[:, :-1], windows[:, 1:], validate=False), validate=False
         )
-        bends = (steps.diff(dim=0) if self.difference == 2 else steps) * self.weight
-        return 0.5 * (total + self.smooth_weight * bends.square().sum())
+        bends = steps[:, 1] - steps[:, 0] if self.difference == 2 else steps[:, 0]
+        return bends * self.weight * math.sqrt(self.smooth_weight)
 
-    def body_gradient(self, control_points: Tensor) -> tuple[float, Tensor]:
-        """Cost and its gradient as body cotangents (count, 6)."""
-        leaf = control_points.requires_grad_()
-        cost = self.cost(leaf)
-        (gradient,) = torch.autograd.grad(cost, leaf)
+    def cost(self, control_points: Tensor) -> float:
+        """Half the weighted sum of squares."""
+        total = 0.0
+        with torch.no_grad():
+            for first, residual, width in self._parts(_ROWS):
+                total += residual(_windows(control_points, first, width)).square().sum().item()
+        return 0.5 * total
+
+    def normal_equations(self, control_points: Tensor) -> tuple[FloatArray, FloatArray]:
+        """Lower band of J^T J, and J^T r, for body tangents of the control points."""
+        equations = NormalEquations(self.knots.count, max(self.knots.order, self.difference + 1), 6)
         algebra = self.group.arithmetic
-        body = join(algebra.pull(split(leaf.detach()), split(gradient)), gradient)
-        return cost.item(), body
+        for first, residual, width in self._parts(_ROWS):
+            leaf = _windows(control_points, first, width).requires_grad_()
+            r = residual(leaf)
+            rows = []
+            for column in r.unbind(-1):
+                (gradient,) = torch.autograd.grad(column.sum(), leaf, retain_graph=True)
+                rows.append(join(algebra.pull(split(leaf.detach()), split(gradient)), gradient))
+            equations.add(torch.stack(rows, dim=1), r.detach(), first)
+        band, right = equations.band(), equations.right_side()
+        band[0] += self.tiny * self.weight.square().repeat(self.knots.count).numpy()
+        return band, right
 
-    def solve(self, max_iterations: int, tolerance: float, advance) -> tuple[Tensor, list[float], str]:
-        """L-BFGS on body tangents, started from the banded matrix; steps are halved until the cost falls."""
+    def solve(
+        self, max_iterations: int, tolerance: float, advance: Callable[[float], None]
+    ) -> tuple[Tensor, list[float], str]:
+        """Levenberg-Marquardt with Marquardt's scaling, in body tangents of the control points."""
         points = self.start()
-        cost, gradient = self.body_gradient(points)
-        history = [cost]
-        memory: list[tuple[Tensor, Tensor]] = []
+        history = [self.cost(points)]
+        damping = 1e-6
         for _ in range(max_iterations):
-            step = -self._inverse_hessian(gradient, memory)
-            points, taken = self._line_search(points, step, cost)
-            if taken is None:
-                return points, history, "no step along the gradient lowers the cost any more"
-            before = gradient
-            cost, gradient = self.body_gradient(points)
+            band, right = self.normal_equations(points)
+            moved = None
+            while moved is None:
+                moved = self._step(points, band, right, damping, history[-1])
+                damping = max(0.1 * damping, 1e-15) if moved is not None else max(10.0 * damping, 1e-12)
+                if damping > 1e12:
+                    return points, history, "no step lowers the cost any more"
+            points, cost = moved
             history.append(cost)
             advance(cost)
             if history[-2] - cost <= tolerance * history[-2]:
                 return points, history, f"the cost fell by less than a share of {tolerance:g}"
-            change = gradient - before
-            if (change * taken).sum() > 0:
-                memory = [*memory[1 - _MEMORY :], (taken, change)]
         return points, history, f"{max_iterations} iterations"
 
-    def _inverse_hessian(self, gradient: Tensor, memory: list[tuple[Tensor, Tensor]]) -> Tensor:
-        """The two-loop recursion over remembered steps and gradient changes."""
-        shares = []
-        for step, change in reversed(memory):
-            share = (step * gradient).sum() / (step * change).sum()
-            gradient = gradient - share * change
-            shares.append(share)
-        result = torch.from_numpy(self.factor.solve(gradient.numpy())) / self.weight.square()
-        for (step, change), share in zip(memory, reversed(shares), strict=True):
-            result = result + (share - (change * result).sum() / (step * change).sum()) * step
-        return result
+    def _step(
+        self, points: Tensor, band: FloatArray, right: FloatArray, damping: float, cost: float
+    ) -> tuple[Tensor, float] | None:
+        """The moved control points and their cost, None if it is not below `cost`."""
+        damped = band.copy()
+        damped[0] *= 1.0 + damping
+        try:
+            step = -BandedCholesky(damped).solve(right)
+        except np.linalg.LinAlgError:  # rounding made the matrix indefinite
+            return None
+        tangents = torch.from_numpy(step.reshape(-1, 6))
+        moved = self.group.retract(points, tangents, side="right", validate=False)
+        reached = self.cost(moved)
+        return (moved, reached) if reached < cost else None
 
-    def _line_search(self, points: Tensor, step: Tensor, cost: float) -> tuple[Tensor, Tensor | None]:
-        """The moved points and the step taken, None if no share of it lowers the cost."""
-        points = points.detach()
-        for _ in range(12):
-            moved = self.group.retract(points, step, side="right", validate=False)
-            with torch.no_grad():
-                if self.cost(moved).item() < cost:
-                    return moved, step
-            step = 0.5 * step
-        return points, None
+
+def _windows(control_points: Tensor, first: Tensor, width: int) -> Tensor:
+    """(rows, width, P): the control points from `first` on."""
+    return control_points.detach()[first[:, None] + torch.arange(width)]
 
 
 @contextmanager
@@ -323,7 +360,7 @@ def _bar(show: bool, total: int) -> Iterator:
 
 
 def _notes(
-    order_of_time: Tensor,
+    rows: Tensor,
     dropped: int,
     duplicates: int,
     gaps: list[tuple[float, float]],
@@ -331,7 +368,7 @@ def _notes(
     knots: _Knots,
 ) -> list[str]:
     notes = []
-    if bool((order_of_time.diff() < 0).any()):
+    if bool((rows.diff() < 0).any()):
         notes.append("times were not in order; poses were sorted")
     if dropped:
         notes.append(f"{dropped} poses with NaN were left out")

@@ -1,0 +1,192 @@
+"""Bad arguments of every public function: the error names the argument, what came and what was expected."""
+
+import inspect
+import re
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
+from error_cases import CASES, PENDING
+
+import torchspline
+import torchspline.io as records
+from torchspline.splines.trajectory import Mounted
+
+
+def label(case: Case) -> str:
+    return f"{case.function}-{case.argument}-{case.category}-{case.came}".replace(FOLDER.name, "")
+
+
+def parameter(case: Case) -> Any:
+    missing = PENDING.get((case.function, case.argument, case.category))
+    marks = [pytest.mark.xfail(reason=missing, strict=True)] if missing else []
+    return pytest.param(case, id=label(case), marks=marks)
+
+
+@pytest.mark.parametrize("case", [parameter(case) for case in CASES])
+def test_the_message_says_what_is_wrong(case):
+    function, good = ACCEPTED[case.function]
+    wrong_type = case.category in ("type", "dtype", "mixed dtype")
+    with pytest.raises(TypeError if wrong_type else (ValueError, FileNotFoundError)) as caught:
+        function(**{**good, **case.changes})
+    message = str(caught.value)
+    # Two arguments that do not go together are named in the order of the check; else the culprit comes first.
+    named = re.escape(case.named)
+    if case.category in TOGETHER:
+        assert re.search(rf"\b{named}\b", message), message
+    else:
+        assert re.match(rf"({named}\b|.*\b{named}\b[^:]*: )", message), message
+    assert case.came in message, message
+    assert case.expected in message, message
+
+
+# ---------------------------------------------------------------------- nothing is left out
+
+
+def public() -> dict[str, Callable[..., Any]]:
+    """Functions, constructors and methods by qualified name, found by walking what the package exports."""
+    found: dict[str, Callable[..., Any]] = {}
+
+    def visit(x: Any) -> None:
+        if isinstance(x, ModuleType):
+            names = getattr(x, "__all__", None) or [
+                name
+                for name, y in vars(x).items()
+                if inspect.isfunction(y) and y.__module__ == x.__name__ and not name.startswith("_")
+            ]
+            for name in names:
+                visit(getattr(x, name))
+        elif inspect.isclass(x):
+            if not inspect.isabstract(x) and x.__name__ not in RESULTS:
+                found[x.__name__] = x
+            for name, method in inspect.getmembers(x, inspect.isfunction):
+                own = method.__module__.startswith("torchspline.") and not hasattr(tuple, name)
+                if own and not name.startswith("_") and not getattr(method, "__isabstractmethod__", False):
+                    found[method.__qualname__] = method
+        elif callable(x) and not isinstance(x, torchspline.Group):
+            found[x.__name__] = x
+
+    for root in (torchspline, records, Mounted):
+        visit(root)
+    return found
+
+
+#: What the library makes and hands out; nobody is meant to call these.
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit"}
+
+#: Methods that are public by name alone, with nothing to get wrong.
+UNTRIED = {
+    "PoseFit.rms": "no arguments",
+    "BSpline.extra_repr": "no arguments; PyTorch calls it",
+    "Trajectory.register_tensor": "the constructor calls it, with what it has checked",
+}
+
+#: Parameters that take anything.
+FREE = {
+    **dict.fromkeys(
+        ("validate", "learnable", "degrees", "progress"), "a truth value, and everything has one"
+    ),
+    "device": "goes straight to PyTorch, which lists the devices there are",
+    "source": "goes into messages as it is",
+    "options": "those of BSpline, tried one by one",
+}
+
+_MAKERS = "Group Rn product use_kernels"
+_GROUP_TANGENT = (
+    "Group.exp Group.left_jacobian Group.left_jacobian_inverse "
+    "Group.right_jacobian Group.right_jacobian_inverse"
+)
+_GROUP_POINT = "Group.adjoint Group.inverse Group.log Group.normalize Group.to_matrix"
+_GROUP_TWO = (
+    "Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.interpolate Group.bracket"
+)
+_MATRIX = "Group.from_matrix from_rotation_matrix from_transform_matrix from_transform3d"
+_VECTOR = "from_rotation_vector from_euler"
+_QUATERNION = (
+    "to_xyzw from_xyzw pose_to_xyzw pose_from_xyzw to_rotation_matrix to_rotation_vector to_transform_matrix "
+    "to_euler to_scipy to_pypose from_pypose to_transform3d"
+)
+_POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
+_NEW = "Group.identity Group.random"
+_AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_FILES = "read_poses read_imu write_poses write_imu"
+_WINDOWS = "_Record.seconds _Record.window"
+
+#: Where a kind of mistake cannot be made: category -> reason -> functions.
+NOT_APPLICABLE = {
+    "shape": {
+        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS}",
+        "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
+        "write_poses write_imu",
+    },
+    "dtype": {
+        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS}",
+        "a foreign object with a dtype of its own": "from_pypose from_transform3d",
+    },
+    "device": {
+        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} consistent_signs phantom_points",
+        "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
+    },
+    "nan": {
+        "no numbers": f"{_MAKERS} {_NEW} {_WINDOWS} from_scipy",
+        "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
+    },
+    "zero quaternion": {
+        "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
+        "from_scipy read_imu write_imu ImuRecord",
+        "control points and mount were checked when the trajectory was made": _AT_TIMES,
+        "rows stay as they are until they are used": "PoseRecord",
+    },
+    "count": {
+        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} measure",
+        "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
+    },
+    "time": {
+        "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
+        "SplitBSpline Trajectory.mounted Mounted",
+        "no domain before there is a trajectory": "initial_control_points fit_poses",
+        "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
+    },
+}
+
+#: What counts as a case of the categories above.
+COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}
+
+
+def test_every_public_function_is_tried_with_every_mistake():
+    functions = public()
+    assert set(functions) == set(ACCEPTED) | set(UNTRIED)
+    tried = {(case.function, COUNTS_AS.get(case.category, case.category)) for case in CASES}
+    excused = {
+        (function, category)
+        for category, reasons in NOT_APPLICABLE.items()
+        for names in reasons.values()
+        for function in names.split()
+    }
+    assert {function for function, _ in excused} <= set(ACCEPTED)
+    needed = {(function, category) for function in ACCEPTED for category in NOT_APPLICABLE}
+    assert needed - tried == excused
+
+
+def test_every_parameter_is_tried():
+    tried = {(case.function, argument) for case in CASES for argument in case.changes}
+    parameters = {
+        (name, parameter)
+        for name, function in public().items()
+        if name not in UNTRIED
+        for parameter in inspect.signature(function).parameters
+        if parameter != "self" and parameter not in FREE
+    }
+    assert parameters <= tried, sorted(parameters - tried)
+
+
+@pytest.mark.parametrize("function", ACCEPTED)
+def test_arguments_are_accepted_when_nothing_is_wrong(function):
+    call, good = ACCEPTED[function]
+    call(**good)
+
+
+def test_pending_cases_exist():
+    assert set(PENDING) <= {(case.function, case.argument, case.category) for case in CASES}
