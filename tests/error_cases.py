@@ -21,7 +21,6 @@ from error_arguments import (
     SAMPLES,
     STAMPS,
     TANGENT,
-    TOGETHER,
     TUM_FILE,
     Case,
     Q,
@@ -171,7 +170,7 @@ def cases() -> Iterator[Case]:
     for function in ("Mounted", "measure"):
         yield refused(function, "trajectory", "type", POSE, "got Tensor", "expected a Trajectory")
     plane, turning = BSpline(Rn(2).random(5), group=Rn(2), dt=0.1), BSpline(Q, group=SO3, dt=0.1)
-    yield refused("Mounted", "trajectory", "option", plane, "in R2", "one of SO3, R3xSO3, SE3")
+    yield refused("Mounted", "trajectory", "option", plane, "got R2", "one in SO3, R3xSO3, SE3")
     for bad in (plane, turning):
         yield refused("measure", "trajectory", "option", bad, f"got {bad.group}", "SE3 or R3xSO3")
     for name in ("gravity", "gyroscope_bias", "accelerometer_bias"):
@@ -287,27 +286,5 @@ def files() -> Iterator[Case]:
     for name in ("start_ns", "end_ns"):
         yield refused("_Record.window", name, "type", 1.5, "'float'", "integer")
 
-
-#: Known to be refused in other words, or not at all: (function, argument, category) and what is missing.
-PENDING: dict[tuple[str, str, str], str] = {
-    ("Mounted", "trajectory", "option"): "the message names `mounted`",
-    ("from_transform3d", "transform", "option"): "the message names a matrix",
-    ("from_transform3d", "transform", "nan"): "the message names a matrix",
-    ("from_pypose", "lietensor", "zero quaternion"): "the message names a pose",
-    ("from_pypose", "lietensor", "nan"): "the message names a pose",
-    ("Mounted.evaluate", "T_body_sensor", "batch"): "the message of `compose` names left and right",
-    **{
-        ("measure", "T_body_imu", category): "the message names T_body_sensor, or left and right"
-        for category in TOGETHER
-    },
-    **{(f, "path", "type"): "the message of pathlib does not name the argument" for f in READ_WRITE},
-    **{(f, "record", "type"): "an attribute is missed later, or the length" for f in READ_WRITE[2:]},
-    ("write_poses", "record", "zero quaternion"): "a file is written that `read_poses` refuses",
-    **{(kind, column, "device"): "columns may lie on different devices" for kind, column in COLUMNS},
-    **{
-        (f"_Record.{f}", name, "type"): "the message of `operator.index` does not name the argument"
-        for f, name in (("seconds", "origin_ns"), ("window", "start_ns"), ("window", "end_ns"))
-    },
-}
 
 CASES = list(cases())

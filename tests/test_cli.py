@@ -149,7 +149,8 @@ def test_real_recordings(
 @pytest.mark.realdata
 def test_kitti_with_gravity_along_y(shared_data: Path, tmp_path: Path) -> None:
     done = torchspline(
-        "imu", shared_data / "poses/kitti_00_gt.txt.gz", "--gravity", "[0, 9.80665, 0]", "--rate", "20", "--out", tmp_path
+        "imu", shared_data / "poses/kitti_00_gt.txt.gz", "--gravity", "[0, 9.80665, 0]", "--rate", "20",
+        "--out", tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     mean = read_imu(tmp_path / "imu.csv").accelerometer.mean(0)

@@ -43,7 +43,7 @@ class PoseFit:
     position_residual: Tensor
     #: Per pose as given (N, 3): `Log(R_fitted^T R_measured)`, rad. NaN for poses not used.
     rotation_residual: Tensor
-    #: Poses left out because a number was NaN, and how many share their time with another.
+    #: Poses left out because a number was NaN, and poses beyond the first at the same time.
     dropped: int
     duplicates: int
     #: Stretches (start, end), in the unit of the times, in which nothing but smoothness holds the trajectory.
@@ -71,7 +71,7 @@ def fit_poses(
     representation: Representation = "split",
     position_sigma: float = 0.01,
     rotation_sigma: float = 0.01,
-    smoothness: float = 1e-6,
+    smoothness: float = 1e-9,
     max_iterations: int = 60,
     tolerance: float = 1e-9,
     progress: bool = True,

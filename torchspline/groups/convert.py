@@ -258,7 +258,10 @@ def from_transform3d(transform: Any) -> Tensor:
     from pytorch_kinematics import Transform3d
 
     _instance("transform", transform, Transform3d, "pytorch_kinematics.Transform3d")
-    return SE3.from_matrix(transform.get_matrix())
+    try:
+        return SE3.from_matrix(transform.get_matrix())
+    except ValueError as error:
+        raise ValueError(f"transform: {error}") from None
 
 
 # ---------------------------------------------------------------------- PyPose
@@ -293,11 +296,12 @@ def from_pypose(lietensor: Any) -> Tensor:
     """
     pypose = _pypose()
     _instance("lietensor", lietensor, pypose.LieTensor, "pypose.LieTensor")
-    numbers = lietensor.tensor().detach()
-    if lietensor.ltype == pypose.SO3_type:
-        return from_xyzw(numbers)
-    if lietensor.ltype == pypose.SE3_type:
-        return pose_from_xyzw(numbers)
+    convert = {pypose.SO3_type: from_xyzw, pypose.SE3_type: pose_from_xyzw}.get(lietensor.ltype)
+    if convert is not None:
+        try:
+            return convert(lietensor.tensor().detach())
+        except ValueError as error:
+            raise ValueError(f"lietensor: {error}") from None
     raise ValueError(
         f"lietensor: expected type SO3Type or SE3Type, got {type(lietensor.ltype).__name__}; "
         "turn a tangent into a point with .Exp()"

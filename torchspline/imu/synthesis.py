@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.groups.group import SE3, SO3
-from torchspline.splines.trajectory import MECHANICS, Trajectory
+from torchspline.groups.group import SO3
+from torchspline.splines.trajectory import MECHANICS, Mounted, Trajectory
 
 #: Standard gravity as an acceleration in a world whose z axis points up, m/s^2.
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
@@ -48,8 +48,7 @@ def measure(
     if trajectory.group.name not in MECHANICS:
         raise _no_body(trajectory)
     if T_body_imu is not None:
-        checks.point("T_body_imu", T_body_imu, SE3, "an SE3 pose")
-        trajectory = trajectory.mounted(T_body_imu)
+        trajectory = Mounted(trajectory, T_body_imu, name="T_body_imu")
     motion = trajectory.kinematics(t)
     if motion.rotation is None or motion.acceleration is None or motion.angular_velocity is None:
         raise _no_body(trajectory)

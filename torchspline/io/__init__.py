@@ -6,6 +6,8 @@ To add a format, write one module that ends with its `FORMAT` and name the modul
 from os import PathLike
 from pathlib import Path
 
+import torch
+
 from torchspline.io import euroc, kitti, tum
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
@@ -32,7 +34,7 @@ def read_poses(
         FileNotFoundError: no such file, or no file of stamps.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
-    table, chosen = _open(Path(path), format, "read_poses", "pose_files")
+    table, chosen = _open(_path(path), format, "read_poses", "pose_files")
     assert chosen.read_poses
     if times is not None and not chosen.separate_times:
         raise ValueError(f"{path}: {chosen.name} files hold their own stamps; leave out times={str(times)!r}")
@@ -51,7 +53,7 @@ def read_imu(path: str | PathLike[str], format: str | None = None) -> ImuRecord:
         FileNotFoundError: no such file.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
-    table, chosen = _open(Path(path), format, "read_imu", "imu_files")
+    table, chosen = _open(_path(path), format, "read_imu", "imu_files")
     assert chosen.read_imu
     return chosen.read_imu(table)
 
@@ -65,7 +67,11 @@ def write_poses(path: str | PathLike[str], record: PoseRecord, format: str = "tu
         FileNotFoundError: the folder of `path` does not exist.
         ValueError: a format that is unknown or cannot be written, a record without rows.
     """
-    _write(Path(path), record, format, "write_poses")
+    if isinstance(record, PoseRecord):
+        zero = torch.nonzero((record.rotation == 0).all(-1)).flatten()
+        if len(zero):
+            raise ValueError(f"record: expected quaternions that are not zero, got one at row {int(zero[0])}")
+    _write(path, record, PoseRecord, format, "write_poses")
 
 
 def write_imu(path: str | PathLike[str], record: ImuRecord, format: str = "euroc") -> None:
@@ -77,7 +83,7 @@ def write_imu(path: str | PathLike[str], record: ImuRecord, format: str = "euroc
         FileNotFoundError: the folder of `path` does not exist.
         ValueError: a format that is unknown or cannot be written, a record without rows.
     """
-    _write(Path(path), record, format, "write_imu")
+    _write(path, record, ImuRecord, format, "write_imu")
 
 
 def _formats(action: str, name: str | None) -> list[Format]:
@@ -117,8 +123,19 @@ def _inside(folder: Path, files: list[str]) -> Path:
     raise FileNotFoundError(f"{folder}: expected a folder that holds {' or '.join(files)}")
 
 
-def _write(path: Path, record: PoseRecord | ImuRecord, name: str, action: str) -> None:
+def _path(path: str | PathLike[str]) -> Path:
+    if not isinstance(path, (str, PathLike)):
+        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+    return Path(path)
+
+
+def _write(
+    path: str | PathLike[str], record: PoseRecord | ImuRecord, kind: type, name: str, action: str
+) -> None:
+    path = _path(path)
     (form,) = _formats(action, name)
+    if not isinstance(record, kind):
+        raise TypeError(f"record: expected a {kind.__name__}, got {type(record).__name__}")
     if not len(record):
         raise ValueError(f"{path}: expected rows to write, got an empty record")
     getattr(form, action)(path, record)

@@ -8,6 +8,13 @@ import torch
 from torch import Tensor
 
 
+def _whole(name: str, x: int) -> int:
+    try:
+        return index(x)
+    except TypeError as error:
+        raise TypeError(f"{name}: expected whole nanoseconds, {error}") from None
+
+
 @dataclass(frozen=True, eq=False)
 class _Record:
     """Rows that share one column of stamps; the subclasses say which columns there are and how wide."""
@@ -30,6 +37,10 @@ class _Record:
         if value.ndim != 1 + len(tail) or tuple(value.shape[1:]) != tail:
             wanted = f"({', '.join(['N', *map(str, tail)])}{'' if tail else ','})"
             raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        if value.device != self.time_ns.device:
+            raise ValueError(
+                f"{name}: expected device {self.time_ns.device} as the stamps, got {value.device}"
+            )
         if len(value) != len(self):
             raise ValueError(f"{name}: expected {len(self)} rows as there are stamps, got {len(value)}")
 
@@ -48,7 +59,7 @@ class _Record:
             if not len(self):
                 return self.time_ns.double()
             origin_ns = int(self.time_ns[0])
-        return (self.time_ns - index(origin_ns)).double() / 1e9
+        return (self.time_ns - _whole("origin_ns", origin_ns)).double() / 1e9
 
     @property
     def time(self) -> Tensor:
@@ -61,7 +72,7 @@ class _Record:
         Raises:
             TypeError: ends that are not integers (a float cannot hold an epoch stamp in nanoseconds).
         """
-        keep = (self.time_ns >= index(start_ns)) & (self.time_ns <= index(end_ns))
+        keep = (self.time_ns >= _whole("start_ns", start_ns)) & (self.time_ns <= _whole("end_ns", end_ns))
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return type(self)(**{k: v[keep] if isinstance(v, Tensor) else v for k, v in values.items()})
 

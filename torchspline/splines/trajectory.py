@@ -129,22 +129,23 @@ class Trajectory(nn.Module, ABC):
 
 
 class Mounted(Trajectory):
-    """A trajectory shifted to a frame on the same rigid body: values `X(t) T`."""
+    """A trajectory shifted to a frame on the same rigid body: values `X(t) T`.
 
-    def __init__(self, trajectory: Trajectory, T_body_sensor: Tensor):
+    Args:
+        T_body_sensor: see `Trajectory.mounted`; `name` is what errors call it.
+    """
+
+    def __init__(self, trajectory: Trajectory, T_body_sensor: Tensor, name: str = "T_body_sensor"):
         super().__init__()
         if not isinstance(trajectory, Trajectory):
             raise TypeError(f"trajectory: expected a Trajectory, got {type(trajectory).__name__}")
         if trajectory.group.name not in _ATTACH:
             raise ValueError(
-                f"mounted: a frame cannot be attached to a trajectory in {trajectory.group}; expected one of "
-                f"{', '.join(_ATTACH)}"
+                f"trajectory: expected one in {', '.join(_ATTACH)}, to whose body a frame can be attached, "
+                f"got {trajectory.group}"
             )
-        checks.is_floating_tensor("T_body_sensor", T_body_sensor)
-        checks.has_last("T_body_sensor", T_body_sensor, 7, "an SE3 pose")
-        checks.finite("T_body_sensor", T_body_sensor)
-        checks.quaternions("T_body_sensor", T_body_sensor, ((3, 7),))
-        self.trajectory = trajectory
+        checks.point(name, T_body_sensor, SE3, "an SE3 pose")
+        self.trajectory, self.name = trajectory, name
         self.group = trajectory.group
         self.T_body_sensor: Tensor
         self.register_tensor("T_body_sensor", T_body_sensor)
@@ -157,7 +158,9 @@ class Mounted(Trajectory):
         """Value and time derivatives of the attached frame, see `Trajectory.evaluate`."""
         state = self.trajectory.evaluate(t, derivatives)
         T = self.T_body_sensor
-        checks.same_kind(trajectory=state.value, T_body_sensor=T)
+        checks.same_kind(trajectory=state.value, **{self.name: T})
+        batch = state.value.shape[: -2 if t.ndim > 0 else -1]
+        checks.broadcast(trajectory=batch, **{self.name: T.shape[:-1]})
         if T.ndim > 1 and t.ndim > 0:  # the times come between the batch and the components
             T = T.unsqueeze(-2)
         return _ATTACH[self.group.name](state, T)
