@@ -74,7 +74,6 @@ RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit"}
 UNTRIED = {
     "PoseFit.rms": "no arguments",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
-    "Trajectory.register_tensor": "the constructor calls it, with what it has checked",
 }
 
 #: Parameters that take anything.

@@ -203,7 +203,7 @@ def imu(
 def show(
     group: str,
     order: int = 4,
-    derivatives: int = 2,
+    derivatives: Literal[0, 1, 2, 3] = 2,
     sweep: Literal["forward", "reverse"] = "forward",
     precision: Literal["float64", "float32"] = "float64",
 ) -> int:
@@ -250,6 +250,8 @@ def _longest_stretch(record: PoseRecord, gap: float | None, start: float, durati
         ((int(time[a]), int(time[b - 1])) for a, b in pairwise(edges)),
         key=lambda stretch: stretch[1] - stretch[0],
     )
+    if not (math.isfinite(start) and start >= 0):
+        raise ValueError(f"start: expected seconds, zero or more, got {start}")
     low += round(start * _NS)
     if math.isfinite(duration):
         high = min(high, low + round(duration * _NS))
@@ -332,7 +334,7 @@ def main() -> None:
 
     try:
         status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
-    except (ValueError, OSError) as error:
+    except (TypeError, ValueError, OSError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2
     sys.exit(status)

@@ -87,10 +87,6 @@ class GroupArithmetic(ABC):
         """Ad_X v, [S20] (3)."""
         return self.adjoint_inverse(self.inverse(X), v)
 
-    def coadjoint(self, X: Vector, g: Vector) -> Vector:
-        """Transpose of `adjoint`, applied to a cotangent."""
-        return self.coadjoint_inverse(self.inverse(X), g)
-
     @abstractmethod
     def bracket(self, a: Vector, b: Vector) -> Vector:
         """[a, b] = ad_a b. Corrects [S20] (6), which should read V W - W V."""

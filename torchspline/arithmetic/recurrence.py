@@ -1,7 +1,7 @@
 """The cumulative product `X(u) = X_0 Exp(l_1 d_1) ... Exp(l_n d_n)` on any group, O(n) in every direction.
 
-Written once, for every group and every family of curves that is a product of geodesics: B-splines ([S20] 4-5),
-geodesic interpolation, Hermite segments ([E17]).
+Written once, for every group and every family of curves that is a product of geodesics: B-splines ([S20] 4-5) and
+geodesic interpolation; Hermite segments ([E17]) have the same form.
 
 ===============  =======================================================================  ===================
 symbol           meaning                                                                  [S20]
@@ -38,6 +38,32 @@ class Step(NamedTuple):
     factor: Vector
     carried: tuple[Vector, ...]
     rates: tuple[Vector, ...]
+
+
+def difference(group: GroupArithmetic, X: Vector, Y: Vector) -> Vector:
+    """d = Log(X^-1 Y), [S20] (24)."""
+    return group.log(group.between(X, Y))
+
+
+def difference_reverse(group: GroupArithmetic, d: Vector, g: Vector) -> tuple[Vector, Vector]:
+    """Body cotangents of X and Y, from that of their difference; [S20] (47), transposed, for any group."""
+    of_first = negate(group.left_jacobian_inverse_transpose(d, g, short=True))
+    return of_first, group.right_jacobian_inverse_transpose(d, g, short=True)
+
+
+def difference_tangent(group: GroupArithmetic, d: Vector, first_rate: Vector, second_rate: Vector) -> Vector:
+    """Change of the difference when X and Y move with these body tangents."""
+    of_first = negate(group.left_jacobian_inverse(d, first_rate, short=True))
+    return add(of_first, group.right_jacobian_inverse(d, second_rate, short=True))
+
+
+def parameter_cotangent(weights_g: Weights, weights: Weights) -> Scalar:
+    """Cotangent of u: each derivative of a weight moves with u at the rate of the next one."""
+    total: Scalar = 0.0
+    for row_g, next_row in zip(weights_g, weights[1:], strict=True):
+        for g, rate in zip(row_g, next_row, strict=True):
+            total = plus(total, times(g, rate))
+    return total
 
 
 def _transport(group: GroupArithmetic, factor: Vector, v: Vector) -> Vector:

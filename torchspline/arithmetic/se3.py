@@ -84,7 +84,7 @@ class SE3(AdjointSeriesGroup):
         )
 
     def inverse_jacobian_series(self, x: Vector, short: bool = False) -> tuple[Scalar, ...]:
-        """z / (1 - exp(-z)) has no odd term beyond the first; the even ones follow from its value and slope."""
+        """z / (exp(z) - 1) has no odd term but -z/2; the even ones follow from its value and slope."""
         angle2 = dot(x[3:], x[3:])
         e, slope = series.bernoulli_factor(angle2, short)
         return (-0.5, e - angle2 * slope, 0.0, -slope)

@@ -46,7 +46,7 @@ class PoseFit:
     #: Poses left out because a number was NaN, and poses beyond the first at the same time.
     dropped: int
     duplicates: int
-    #: Stretches (start, end), in the unit of the times, in which nothing but smoothness holds the trajectory.
+    #: Stretches (start, end), in the unit of the times, of more than two knot intervals without a pose.
     gaps: list[tuple[float, float]]
     #: Half the weighted sum of squares after the linear start and after each iteration.
     cost: list[float]
@@ -198,7 +198,7 @@ class _Knots:
         return located.segment.numpy(), located.u.numpy()
 
     def gaps(self, times: Tensor) -> list[tuple[float, float]]:
-        """Stretches between neighbouring poses in which at least one whole knot interval has no pose."""
+        """Stretches between neighbouring poses longer than two knot intervals."""
         steps = times.diff()
         wide = torch.nonzero(steps > 2 * self.dt).flatten().tolist()
         return [(times[i].item(), times[i + 1].item()) for i in wide]
@@ -377,7 +377,8 @@ def _notes(
     if gaps:
         longest = max(b - a for a, b in gaps) * (1e-9 if knots.nanoseconds else 1.0)
         notes.append(
-            f"{len(gaps)} stretches without poses, up to {longest:.3g} s, were bridged by smoothness alone"
+            f"{len(gaps)} stretches of more than two knot intervals without poses, up to {longest:.3g} s, "
+            "were bridged by smoothness"
         )
     if used < knots.count:
         notes.append(

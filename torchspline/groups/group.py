@@ -19,7 +19,9 @@ Side = Literal["left", "right"]
 class Group:
     """A Lie group by name: "SO3", "SE3", "R<n>", or a direct product such as "R3xSO3".
 
-    Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`. Quaternions are [w, x, y, z] and may
+    Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`, [v, omega] in m and rad; leading dimensions
+    broadcast. Every method is differentiable in its tensors to any order, forwards and backwards; `log`,
+    `interpolate` and what is built on them jump where a rotation is by exactly pi. Quaternions are [w, x, y, z] and may
     have any length from 1e-15 to 1e15: no function depends on it, and gradients are orthogonal to them. Methods
     raise `TypeError` for a wrong dtype or type and `ValueError` for a wrong shape, device or value (values are
     looked at on the CPU only).
@@ -166,7 +168,7 @@ class Group:
         return join(self.arithmetic.normalize(split(stored)), stored).squeeze(-2)
 
     def adjoint(self, point: Tensor, *, validate: bool = True) -> Tensor:
-        """The matrix of Ad_X, [S20] (3): `X Exp(v) = Exp(Ad_X v) X`. `(..., D, D)`."""
+        """The matrix of Ad_X, [S20] (3), (4): `X Exp(v) = Exp(Ad_X v) X`. `(..., D, D)`."""
         self._accept(validate, point=(point, "point"))
         X = self.arithmetic.normalize(split(point.unsqueeze(-2)))
         return self._matrix(lambda v: self.arithmetic.adjoint(X, v), point)
@@ -190,7 +192,7 @@ class Group:
         return self._jacobian("left_jacobian", tangent, validate)
 
     def right_jacobian(self, tangent: Tensor, *, validate: bool = True) -> Tensor:
-        """J_r `(..., D, D)`, [S20] (8), (72): `Exp(x + v) = Exp(x) Exp(J_r(x) v)` to first order."""
+        """J_r `(..., D, D)`, [S20] (8), (10), (72): `Exp(x + v) = Exp(x) Exp(J_r(x) v)` to first order."""
         return self._jacobian("right_jacobian", tangent, validate)
 
     def left_jacobian_inverse(self, tangent: Tensor, *, validate: bool = True) -> Tensor:

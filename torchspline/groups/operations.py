@@ -16,7 +16,15 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.recurrence import Step, forward, reverse, tangent
+from torchspline.arithmetic.recurrence import (
+    Step,
+    difference,
+    difference_reverse,
+    difference_tangent,
+    forward,
+    reverse,
+    tangent,
+)
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, add, negate, zero
@@ -36,8 +44,9 @@ Arguments = tuple[Vector, ...]
 class Operation(ABC):
     """One operation on components. Points are stored numbers, quaternions of any length."""
 
-    #: What each argument is: "point", or anything else whose numbers only have to be finite.
+    #: What each argument is: "point", or anything else whose numbers only have to be finite; and what the result is.
     kinds: tuple[str, ...]
+    result = "point"
 
     @abstractmethod
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
@@ -70,6 +79,7 @@ class Exp(Operation):
 
 class Log(Operation):
     kinds = ("point",)
+    result = "tangent"
 
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         (stored,) = arguments
@@ -122,6 +132,7 @@ class Inverse(Operation):
 
 class Act(Operation):
     kinds = ("point", "vector")
+    result = "vector"
 
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
         stored, point = arguments
@@ -147,7 +158,7 @@ class Interpolate(Operation):
     def _sweep(group: GroupArithmetic, arguments: Arguments) -> tuple[Vector, Vector, list[Step]]:
         start, end, s = arguments
         a, b = group.normalize(start), group.normalize(end)
-        d = group.log(group.between(a, b))
+        d = difference(group, a, b)
         value, trace = forward(group, a, [d], [s], derivatives=0)
         return d, value, trace
 
@@ -158,18 +169,14 @@ class Interpolate(Operation):
         start, end, s = arguments
         d, value, trace = self._sweep(group, arguments)
         g, (d_g,), (s_g,) = reverse(group, [d], [s], trace, group.pull(value, cotangent), [])
-        g = add(g, negate(group.left_jacobian_inverse_transpose(d, d_g, short=True)))
-        end_g = group.right_jacobian_inverse_transpose(d, d_g, short=True)
-        return group.embed(start, g), group.embed(end, end_g), tuple(s_g)
+        start_g, end_g = difference_reverse(group, d, d_g)
+        return group.embed(start, add(g, start_g)), group.embed(end, end_g), tuple(s_g)
 
     def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
         start, end, s = arguments
         d, value, trace = self._sweep(group, arguments)
         start_rate, end_rate = group.extract(start, rates[0]), group.extract(end, rates[1])
-        d_rate = add(
-            group.right_jacobian_inverse(d, end_rate, short=True),
-            negate(group.left_jacobian_inverse(d, start_rate, short=True)),
-        )
+        d_rate = difference_tangent(group, d, start_rate, end_rate)
         xi, _ = tangent(group, [d], [s], trace, start_rate, [d_rate], [rates[2]])
         return group.push(value, xi)
 
@@ -187,7 +194,8 @@ OPERATIONS: dict[str, Operation] = {
 
 def _result_size(operation: str, group: str) -> int:
     sizes = arithmetic(group)
-    return {"log": sizes.tangent_size, "act": sizes.act_size}.get(operation, sizes.point_size)
+    by_kind = {"point": sizes.point_size, "tangent": sizes.tangent_size, "vector": sizes.act_size}
+    return by_kind[OPERATIONS[operation].result]
 
 
 def _forward(operation: str, group: str, *arguments: Tensor) -> Tensor:

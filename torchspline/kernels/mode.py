@@ -25,7 +25,8 @@ _mode: ContextVar[str | None] = ContextVar("torchspline_kernels", default=None)
 def use_kernels(mode: Mode) -> Iterator[None]:
     """Within the block use compiled kernels where they can ("auto"), must ("fused"), or may not ("reference") run.
 
-    The results are the same up to rounding. "fused" raises `RuntimeError` for calls that no kernel can serve.
+    The results are the same up to rounding. "fused" raises `RuntimeError` where a kernel exists but cannot run; calls
+    that have none (extrapolation, group operations on few rows, linear maps) use the reference in every mode.
     """
     checks.choice("mode", mode, MODES)
     token = _mode.set(mode)

@@ -6,9 +6,9 @@ from fractions import Fraction
 import torch
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.recurrence import forward, reverse
+from torchspline.arithmetic.recurrence import difference_reverse, forward, parameter_cotangent, reverse
 from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, dot, negate, plus, scale, times
+from torchspline.arithmetic.vector import Vector, dot, plus, scale, times
 from torchspline.checks import LONGEST_QUATERNION, SHORTEST_QUATERNION
 from torchspline.kernels.trace import Symbol, Trace, indicator, trace
 
@@ -70,10 +70,7 @@ def reverse_program(
         start_g, steps_g, weights_g = reverse(
             group, chopped, used, sweep, group.pull(value, value_g), cotangents, short=True
         )
-        u_g: Scalar = 0.0
-        for row_g, next_row in zip(weights_g, weights[1:], strict=True):
-            for g, rate in zip(row_g, next_row, strict=True):
-                u_g = plus(u_g, times(g, rate))
+        u_g = parameter_cotangent(weights_g, weights)
         return [*start_g, *(c for g in steps_g for c in g), u_g]
 
     sizes = [1, group.point_size, group.point_size, derivatives * size, count * size, derivatives]
@@ -113,6 +110,5 @@ def valid_point(group: GroupArithmetic, stored: Vector) -> Symbol:
 
 def pairs_reverse(group: GroupArithmetic, d: Vector, g: Vector) -> list[Scalar]:
     """Body cotangents of second and first of a pair, from its logarithm and the cotangent of that."""
-    second = group.right_jacobian_inverse_transpose(d, g, short=True)
-    first = negate(group.left_jacobian_inverse_transpose(d, g, short=True))
+    first, second = difference_reverse(group, d, g)
     return [*second, *first]

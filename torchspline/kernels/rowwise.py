@@ -25,7 +25,7 @@ class RowKernel:
         name: a Python name, unique to the function.
         function: components of the arguments to components of the result, one flat sequence.
         sizes: components of each argument. results: of each output.
-        valid: components of the arguments to a condition that refuses a row; None accepts all.
+        valid: components of the arguments to the condition under which a row is accepted; None accepts all.
     """
 
     def __init__(

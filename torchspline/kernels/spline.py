@@ -44,7 +44,7 @@ class Clock:
         return self.times, self.shared, t0, dt, self.tolerance, self.segments, self.points, self.queries
 
     def reach(self, begin: int, stop: int, order: int) -> tuple[int, int]:
-        """First and last-but-one control point that queries `begin` to `stop` touch, over all trajectories."""
+        """First control point that queries `begin` to `stop` touch and one past the last, over all trajectories."""
         first, last = begin // self.queries, (stop - 1) // self.queries
         everything = first * self.points, (last + 1) * self.points
         if first < last:

@@ -31,8 +31,6 @@ SPELLING: dict[str, str] = {
 }
 _SYMMETRIC = {"add", "mul", "eq", "and", "or"}
 
-Operand = "Symbol | float"
-
 
 class Operation(NamedTuple):
     """`kind` of numbered values or constants; an input has kind "input" and its position."""

@@ -5,7 +5,7 @@ time within a segment in units of the knot spacing.
 """
 
 from fractions import Fraction
-from functools import lru_cache
+from functools import cache, lru_cache
 from math import comb, factorial
 
 import torch
@@ -45,12 +45,19 @@ def cumulative_matrix(order: int) -> RationalMatrix:
     )
 
 
-@lru_cache(maxsize=None, typed=True)  # 4.0 equals 4, but is no order
+@cache
 def derivative_matrix(matrix: RationalMatrix, derivative: int) -> RationalMatrix:
     """The rows' polynomials differentiated; as many columns as before, the last ones zero."""
     for _ in range(derivative):
         matrix = tuple((*(n * row[n] for n in range(1, len(row))), Fraction(0)) for row in matrix)
     return matrix
+
+
+@cache
+def _columns(order: int, derivative: int) -> list[tuple[float, ...]]:
+    """Coefficients by power, then by j, of the derivatives of `l_1 ... l_(k-1)`."""
+    rows = derivative_matrix(cumulative_matrix(order), derivative)[1:]
+    return [tuple(float(row[n]) for row in rows) for n in range(order)]
 
 
 def cumulative_weights(u: Tensor, order: int, derivatives: int) -> list[tuple[Tensor, ...]]:
@@ -63,8 +70,7 @@ def cumulative_weights(u: Tensor, order: int, derivatives: int) -> list[tuple[Te
     """
     rows = []
     for r in range(derivatives + 1):
-        matrix = derivative_matrix(cumulative_matrix(order), r)[1:]
-        columns = torch.tensor([[float(c) for c in row] for row in matrix], dtype=u.dtype, device=u.device).mT
+        columns = torch.tensor(_columns(order, r), dtype=u.dtype, device=u.device)
         columns = columns.reshape(order, order - 1, *(1,) * u.ndim)
         # Horner's rule rather than a matrix product, which autocast or TF32 would round.
         value = columns[-1].expand(order - 1, *u.shape)

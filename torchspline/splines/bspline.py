@@ -251,7 +251,7 @@ class BSpline(Trajectory):
             control_points = control_points.clone(memory_format=torch.contiguous_format)
             if learnable:
                 control_points = nn.Parameter(control_points)
-        self.register_tensor("control_points", control_points)
+        self._keep("control_points", control_points)
         nanoseconds = dt_ns is not None or t0_ns is not None
         probe = torch.zeros(
             (), dtype=torch.int64 if nanoseconds else torch.float64, device=control_points.device
@@ -264,7 +264,7 @@ class BSpline(Trajectory):
             for name, x in (("dt", dt), ("t0", t0)):
                 if not isinstance(x, nn.Parameter) and not (isinstance(x, Tensor) and x.requires_grad):
                     x = torch.as_tensor(x, dtype=torch.float64, device=control_points.device).clone()
-                self.register_tensor(name, x)
+                self._keep(name, x)
 
     def _apply(self, fn: Any, recurse: bool = True) -> "BSpline":
         """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
@@ -323,7 +323,7 @@ class BSpline(Trajectory):
 class SplitBSpline(BSpline):
     """A B-spline of split poses `[x, y, z, qw, qx, qy, qz]`: position in R3 and rotation in SO3, interpolated apart.
 
-    [S20] and [H18] both find it as accurate as SE(3) and cheaper: `BSpline` on the group `R3xSO3`.
+    [S20] finds no advantage in SE(3), and [H18] recommends the split: this is `BSpline` on the group `R3xSO3`.
     """
 
     def __init__(self, control_points: Tensor, **options: Any):

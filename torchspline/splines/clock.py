@@ -35,14 +35,14 @@ def locate(
         t: seconds (float) with `t0`, `dt` in seconds, or whole nanoseconds (int64) with both in nanoseconds.
         segments: the domain is `[t0, t0 + segments dt]`; a few rounding errors beyond belong to it.
     Raises:
-        ValueError: see `_none_outside` and `check_float32`. Where values cannot be seen (other devices, `vmap`,
+        ValueError: see `_refuse` and `check_float32`. Where values cannot be seen (other devices, `vmap`,
             compilation) times outside give NaN instead.
     """
     if t.dtype == torch.int64:
         elapsed = t - t0
         segment = torch.div(elapsed, dt, rounding_mode="floor").clamp(0, segments - 1)
         within = (elapsed - segment * dt).to(torch.float64)
-        u = within / (dt.to(torch.float64) if isinstance(dt, Tensor) else float(dt))
+        u = within / float(dt)
     else:
         if validate:
             check_float32(t, dt)
@@ -55,7 +55,7 @@ def locate(
     if validate:
         slack = tolerance(t, t0, dt, segments)
         outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
-        if _none_outside(t, t0, dt, segments, outside) is None:
+        if not _refuse(outside, t, t0, dt, segments):
             u = torch.where(outside, torch.nan, u)
     return Located(segment, u, None)
 
@@ -86,15 +86,13 @@ def check_float32(t: Tensor, dt: Tensor | float) -> None:
         )
 
 
-def _none_outside(
-    t: Tensor, t0: Tensor | float | int, dt: Tensor | float | int, segments: int, outside: Tensor
-) -> bool | None:
-    """True if no time is outside, an error if one is, None where values cannot be seen."""
-    if not checks.values_visible(t, outside):
-        return None
-    seen = checks.seen_true(outside.any())
+def _refuse(
+    outside: Tensor, t: Tensor, t0: Tensor | float | int, dt: Tensor | float | int, segments: int
+) -> bool:
+    """An error if a time is outside; else whether values could be seen at all."""
+    seen = checks.seen_true(outside.any()) if checks.values_visible(t, outside) else None
     if not seen:
-        return None if seen is None else True
+        return seen is not None
     unit = "ns" if t.dtype == torch.int64 else "s"
     first = t.detach()[outside].flatten()[0].item()
     end = _detach(t0) + segments * _detach(dt)

@@ -1,7 +1,7 @@
 """The uniform B-spline through compiled kernels: one call forward, one call backward."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchspline.kernels.mode import RefusedError, batched, flat, transformed
-from torchspline.kernels.spline import Clock, Pairs, SplineKernels
+from torchspline.kernels.spline import Clock, SplineKernels
 from torchspline.splines.basis import cumulative_matrix
 from torchspline.splines.clock import tolerance
 
 
-@dataclass
+@dataclass(frozen=True)
 class Call:
     """What does not change hands as a tensor: sizes, knots as numbers, and the same computation by the reference."""
 
@@ -27,7 +27,6 @@ class Call:
     tolerance: float | None
     #: (control_points, t, t0, dt) -> value and rates per second.
     reference: Callable[[Tensor, Tensor, Any, Any], tuple[Tensor, ...]]
-    pairs: Pairs = field(init=False)
 
     def clock(self, control_points: Tensor, t: Tensor) -> Clock:
         trajectories = control_points.shape[:-2].numel()
@@ -96,15 +95,15 @@ class FusedBSpline(Function):
     ) -> tuple[Tensor, ...]:
         batch = control_points.shape[:-2]
         clock = call.clock(control_points, t)
-        call.pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
+        pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
         if bad and call.tolerance is not None:
             raise RefusedError
         sizes = call.kernels.result_sizes
         outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
-        outside = call.kernels.forward(call.pairs, clock, [flat(x) for x in outputs])
+        outside = call.kernels.forward(pairs, clock, [flat(x) for x in outputs])
         if outside:
             raise RefusedError
-        ctx.call = call
+        ctx.call, ctx.pairs = call, pairs
         ctx.save_for_backward(control_points, t, t0, dt)
         # Not saved for backward: there, writing to a result in place would be an error, which it is not elsewhere.
         ctx.results = tuple(x.detach() for x in (outputs[:1] if dt is None else outputs))
@@ -126,7 +125,7 @@ class FusedBSpline(Function):
         ]
         clock = call.clock(control_points, t)
         value, value_g, *rates_g = map(flat, (results[0], *filled))
-        stored_g, u_g = call.kernels.reverse(flat(control_points), call.pairs, clock, value, value_g, rates_g)
+        stored_g, u_g = call.kernels.reverse(flat(control_points), ctx.pairs, clock, value, value_g, rates_g)
         t_g = None
         if any(ctx.needs_input_grad[1:4]):
             t_g = torch.from_numpy(u_g).reshape(shape).to(torch.float64) / call.dt

@@ -4,28 +4,25 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.groups.components import join, split
 from torchspline.groups.group import Group
-from torchspline.splines.sweep import cumulative_bspline
-
-#: The correction of a phantom point converges linearly, by about a factor of 10 for rotations of 0.5 rad.
-_CORRECTIONS = 20
+from torchspline.splines.sweep import continue_signs, first, second
 
 
 def consistent_signs(points: Tensor, group: Group) -> Tensor:
     """The same points `(*batch, M, P)`, unit, each quaternion on the side of its predecessor.
 
     A rotation has two quaternions; component-wise filters, plots and fits need neighbours that do not jump between
-    them.
+    them. Differentiable in `points`.
+
+    Raises:
+        TypeError, ValueError: a wrong type, dtype, shape or value.
     """
     _check_group(group)
     checks.points("points", points, group, least=1)
-    # An order-2 spline passes through its control points and already keeps signs continuous.
-    if points.shape[-2] == 1:
-        return group.normalize(points, validate=False)
-    count = points.shape[-2]
-    index = torch.arange(count, device=points.device).clamp(max=count - 2)
-    u = (torch.arange(count, device=points.device) - index).to(points.dtype)
-    return cumulative_bspline(points, u, index, group.name, 2, 0)[0]
+    algebra = group.arithmetic
+    unit = algebra.normalize(split(points))
+    return join(continue_signs(algebra, unit, algebra.between(first(unit), second(unit))), points)
 
 
 def phantom_points(keyframes: Tensor, group: Group, order: int = 4) -> Tensor:

@@ -15,9 +15,17 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.recurrence import Step, forward, reverse, tangent
+from torchspline.arithmetic.recurrence import (
+    Step,
+    difference_reverse,
+    difference_tangent,
+    forward,
+    parameter_cotangent,
+    reverse,
+    tangent,
+)
 from torchspline.arithmetic.registry import arithmetic
-from torchspline.arithmetic.vector import Vector, add, negate, plus, times, zero
+from torchspline.arithmetic.vector import Vector, times, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.nested import outer_levels, primals
 from torchspline.splines.basis import cumulative_weights
@@ -44,20 +52,20 @@ class _Queries(NamedTuple):
 def _pairs(group: GroupArithmetic, control_points: Tensor) -> _Pairs:
     stored = split(control_points)
     points = group.normalize(stored)
-    between = group.between(_first(points), _second(points))
-    return _Pairs(stored, _continue_signs(group, points, between), group.log(between))
+    between = group.between(first(points), second(points))
+    return _Pairs(stored, continue_signs(group, points, between), group.log(between))
 
 
-def _first(components: Vector) -> Vector:
+def first(components: Vector) -> Vector:
     """Of each pair of neighbours the first."""
     return tuple(c[..., :-1] for c in components)
 
 
-def _second(components: Vector) -> Vector:
+def second(components: Vector) -> Vector:
     return tuple(c[..., 1:] for c in components)
 
 
-def _continue_signs(group: GroupArithmetic, points: Vector, between: Vector) -> Vector:
+def continue_signs(group: GroupArithmetic, points: Vector, between: Vector) -> Vector:
     """Flip quaternions so that each lies on the side of its predecessor: the output never jumps in sign."""
     signed = list(points)
     for (start, stop), far in zip(group.sign_blocks, group.long_way(between), strict=True):
@@ -154,8 +162,7 @@ def _reverse(
     per_query = torch.stack([join(g, like).movedim(-1, 0) for g in steps_g], dim=-2)
     steps_sum = _scatter(_flat(per_query), _flat(queries.at), points - 1).unbind(0)
     start_sum = _scatter(join(start_g, like).movedim(-1, 0), index, points).unbind(0)
-    to_second = algebra.right_jacobian_inverse_transpose(pairs.steps, steps_sum, short=True)
-    to_first = negate(algebra.left_jacobian_inverse_transpose(pairs.steps, steps_sum, short=True))
+    to_first, to_second = difference_reverse(algebra, pairs.steps, steps_sum)
     pad = torch.nn.functional.pad
     body = tuple(
         s + pad(second, (1, 0)) + pad(first, (0, 1))
@@ -165,11 +172,7 @@ def _reverse(
 
 
 def _u_gradient(weights_g, weights, like: Tensor, u: Tensor) -> Tensor:
-    """Each derivative of a weight moves with u at the rate of the next one."""
-    total: Any = 0.0
-    for row_g, next_row in zip(weights_g, weights[1:], strict=True):
-        for g, rate in zip(row_g, next_row, strict=True):
-            total = plus(total, times(g, rate))
+    total = parameter_cotangent(weights_g, weights)
     total = join((total,), like).squeeze(-1)
     return total.sum_to_size(u.shape)
 
@@ -193,10 +196,7 @@ def _tangent(
         steps_rate = [start_rate] * (order - 1)
     else:
         body = algebra.extract(pairs.stored, split(control_rate))
-        pair_rate = add(
-            algebra.right_jacobian_inverse(pairs.steps, _second(body), short=True),
-            negate(algebra.left_jacobian_inverse(pairs.steps, _first(body), short=True)),
-        )
+        pair_rate = difference_tangent(algebra, pairs.steps, first(body), second(body))
         start_rate = _take(torch.stack(body), index).unbind(0)
         steps_rate = _take_steps(torch.stack(pair_rate), queries.at, order - 1)
     weights = queries.weights[: derivatives + 1]

@@ -12,7 +12,7 @@ from torchspline.groups.group import SE3, SO3, Group
 
 
 class State(NamedTuple):
-    """Value and time derivatives; those not asked for are None.
+    """Value `(*batch, N, P)` and time derivatives `(*batch, N, D)`; those not asked for are None.
 
     `velocity` is the body-frame tangent `X^-1 dX/dt` per second (for the R^n part of a product that is the plain
     world-frame rate), `acceleration` and `jerk` its derivatives by time.
@@ -67,7 +67,7 @@ def _of_se3(s: State) -> Kinematics:
     return Kinematics(q, s.value[..., :3], velocity, acceleration, w, a[..., 3:])
 
 
-#: How the states of a group read as motion; a group that moves a rigid body adds its line here.
+#: How the states of a group read as motion; a group that moves a rigid body adds its line here and in `_ATTACH`.
 MECHANICS: dict[str, Callable[[State], Kinematics]] = {
     "SO3": _of_so3,
     "R3": _of_r3,
@@ -91,7 +91,7 @@ class Trajectory(nn.Module, ABC):
     def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
         """Value and time derivatives (0 to 3 of them) at the times `t`."""
 
-    def register_tensor(self, name: str, x: Tensor) -> None:
+    def _keep(self, name: str, x: Tensor) -> None:
         """Keep `x` under `name`: a `Parameter` as one, anything else as a buffer, which may carry a graph."""
         self.__dict__.pop(name, None)
         if isinstance(x, nn.Parameter):
@@ -148,7 +148,7 @@ class Mounted(Trajectory):
         self.trajectory, self.name = trajectory, name
         self.group = trajectory.group
         self.T_body_sensor: Tensor
-        self.register_tensor("T_body_sensor", T_body_sensor)
+        self._keep("T_body_sensor", T_body_sensor)
 
     @property
     def domain(self) -> tuple[float, float] | tuple[int, int]:
