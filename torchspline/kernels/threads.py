@@ -6,7 +6,7 @@ Kernels release the interpreter lock, so plain threads are enough; unlike OpenMP
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import torch
 
@@ -54,8 +54,9 @@ def run(tasks: Sequence[Callable[[], None]], threads: int | None = None) -> None
     try:
         work()
     finally:
-        for other in others:
-            other.result()
+        wait(others)  # all of them, also after an error: they write to the caller's arrays
+    for other in others:
+        other.result()
 
 
 def spans(count: int, parts: int, multiple: int) -> list[tuple[int, int]]:
