@@ -72,7 +72,8 @@ def experiment(
         seconds[name] += time.perf_counter()
         print(f"{name}: {seconds[name]:.0f} s", flush=True)
     seconds["verify"] = time.perf_counter() - started - sum(seconds.values())
-    tables = [agreement(deviations), *(table for report in reports.values() for table in report.tables)]
+    tables = [agreement(deviations)] if deviations else []
+    tables += [table for report in reports.values() for table in report.tables]
     if plan.notes:
         tables.append(
             Table("Who did not take part everywhere", ("",), [[note] for note in sorted(plan.notes)])

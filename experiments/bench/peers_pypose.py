@@ -24,8 +24,8 @@ def points(problem: Problem) -> Any:
 def grid(problem: Problem) -> Task:
     """`pypose.bspline`: SE(3), pose only, at even places in every segment."""
     pypose = peer("pypose")
-    if problem.order != 4 or problem.batch:
-        raise UnavailableError("one cubic only")
+    if problem.order != 4 or problem.batch or problem.group not in TO_PYPOSE:
+        raise UnavailableError("one cubic of poses only")
     places = round(problem.queries / problem.segments)
     if places < 2:
         raise UnavailableError("two queries in every segment at least")

@@ -45,7 +45,10 @@ def draw_sweep(title: str, axis: str, rows: Sequence[dict[str, Any]]) -> Figure:
         here = [row for row in rows if row["sweep"] == sweep]
         _lines(axes, here)
         axes.set(xlabel=axis, title=sweep)
-    panels[0].set_ylabel("ns per query")
+    least, most = (
+        edge(row[f"ns_per_query_{which}"] for row in rows) for edge, which in ((min, "min"), (max, "median"))
+    )
+    panels[0].set(ylabel="ns per query", ylim=(0.5 * least, 2 * most))
     figure.suptitle(title)
     handles = {line.get_label(): line for axes in panels for line in axes.get_lines()}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=9)
@@ -74,11 +77,10 @@ def _lines(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
         )
         axes.vlines(x, least, median, color=colour, lw=1)
     axes.set_yscale("log")
-    values = [row["ns_per_query_min"] for row in rows]
-    axes.set_ylim(0.6 * min(values), 2 * max(row["ns_per_query_median"] for row in rows))
     axes.grid(True, which="major", alpha=0.3)
     if words:
-        axes.set_xticks(range(len(places)), places, rotation=15, ha="right")
+        axes.set_xticks(range(len(places)), [str(x).replace(", ", "\n") for x in places])
+        axes.set_xlim(-0.5, len(places) - 0.5)
     else:
         axes.set_xscale("log")
         if max(places) <= 20:  # orders: every one of them
@@ -150,6 +152,7 @@ def draw_operations(rows: Sequence[dict[str, Any]]) -> Figure:
             axes.vlines(x, least, median, color=f"C{i}", lw=1)
         axes.set_yscale("log")
         axes.set_xticks(range(len(names)), names, rotation=15)
+        axes.set_xlim(-0.6, len(names) - 0.4)
         axes.set_title(f"forward + backward, {count} thread{'s' * (count > 1)}")
         axes.grid(True, axis="y", which="both", alpha=0.3)
     panels[0].set_ylabel("ns each")

@@ -9,6 +9,7 @@ from bench.contenders import CONTENDERS, FUSED, Contender
 from bench.problems import Problem, UnavailableError
 from bench.timing import Task, measure, prepared
 
+OVERHEAD = 0.02  # seconds; a shorter call need not grow with the number of queries
 BATCH_POINTS = 32  # control points of each trajectory of a batch
 
 
@@ -96,6 +97,7 @@ def _prepare(
     if problem.total > contender.most:
         raise UnavailableError(f"at most {contender.most:.0e} queries")
     seconds, total = last.get(contender.name, (0.0, problem.total))
-    if contender.name != FUSED and seconds * max(1.0, problem.total / total) > 5 * patience:
+    predicted = seconds * max(1.0, problem.total / total)
+    if contender.name != FUSED and seconds > OVERHEAD and predicted > 5 * patience:
         raise UnavailableError("left out where a call would take too long")
     return contender.prepare(problem)
