@@ -74,6 +74,8 @@ RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit"}
 UNTRIED = {
     "PoseFit.rms": "no arguments",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
+    "BSpline.get_extra_state": "no arguments; PyTorch calls it",
+    "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
 }
 
 #: Parameters that take anything.

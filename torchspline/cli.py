@@ -131,7 +131,7 @@ def imu(
     recording = None if recorded is None else read_imu(recorded)
     record = _longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
-    interval = record.time_ns.diff().to(torch.float64).median().item() / _NS
+    interval = record.time_ns.unique().diff().to(torch.float64).median().item() / _NS
     dt = 5 * interval if spacing is None else spacing * 1e-3
     fit = fit_poses(
         record.time_ns,
@@ -146,6 +146,8 @@ def imu(
         raise ValueError(
             f"margin: nothing is left of {(last - first) / _NS:.3g} s between margins of {margin} s"
         )
+    if (high - low) / _NS * rate > 1e9:
+        raise ValueError(f"rate: {rate:g} Hz over {(high - low) / _NS:g} s makes more than 1e9 readings")
     steps = torch.arange(int((high - low) / _NS * rate) + 1, dtype=torch.float64)
     stamps = low + (steps * (_NS / rate)).round().to(torch.int64)
     with torch.no_grad():
@@ -237,7 +239,10 @@ def _random_motion(duration: float, generator: torch.Generator) -> SplitBSpline:
 def _longest_stretch(record: PoseRecord, gap: float | None, start: float, duration: float) -> PoseRecord:
     """The longest run of usable poses without a larger gap, cut to `start` and `duration`."""
     usable = ~(record.position.isnan().any(-1) | record.rotation.isnan().any(-1))
-    time = record.time_ns[usable].unique()
+    rows = torch.argsort(record.time_ns, stable=True)
+    rows = rows[usable[rows]]
+    record = PoseRecord(record.time_ns[rows], record.position[rows], record.rotation[rows], record.source)
+    time = record.time_ns.unique()
     if len(time) < 2:
         raise ValueError(
             f"poses: {record.source} has {len(time)} usable poses at distinct times; two are needed"
@@ -334,7 +339,7 @@ def main() -> None:
 
     try:
         status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
-    except (TypeError, ValueError, OSError) as error:
+    except (TypeError, ValueError, OSError, MemoryError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2
     sys.exit(status)

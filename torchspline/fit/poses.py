@@ -128,9 +128,10 @@ def fit_poses(
         raise ValueError(f"t: expected at least two distinct times with usable poses, got {distinct}")
 
     knots = _Knots(times, dt, order)
-    measured = consistent_signs(measured, group)
-    problem = _Problem(group, knots, times, measured, (position_sigma, rotation_sigma), smoothness)
-    with _bar(progress, max_iterations) as advance:
+    # Whatever mode the caller is in, gradients are needed here.
+    with torch.inference_mode(False), torch.enable_grad(), _bar(progress, max_iterations) as advance:
+        times, measured = times.clone(), consistent_signs(measured.clone(), group)
+        problem = _Problem(group, knots, times, measured, (position_sigma, rotation_sigma), smoothness)
         control_points, cost, reason = problem.solve(max_iterations, tolerance, advance)
 
     options = knots.options()
@@ -189,6 +190,10 @@ class _Knots:
             segments = math.ceil(span / self.dt - min(3.0 * rounding, 1e-3))
         self.segments = max(int(segments), 1)
         self.count = self.segments + order - 1
+        if self.count > 1_000_000 and self.count > 1000 * len(times):
+            raise ValueError(
+                f"dt: {dt} s makes {self.count} control points for {len(times)} poses; use a larger one"
+            )
 
     def options(self) -> dict[str, Any]:
         return {"dt_ns": self.dt, "t0_ns": self.t0} if self.nanoseconds else {"dt": self.dt, "t0": self.t0}

@@ -74,7 +74,7 @@ def _vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
         checks.same_kind(trajectory=like, **{name: x})
     else:
         try:
-            x = torch.tensor(x, dtype=like.dtype, device=like.device)
+            x = torch.stack([torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in x])
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"{name}: expected a tensor or three numbers, got {x!r}") from None
     checks.has_last(name, x, 3, "x, y, z")

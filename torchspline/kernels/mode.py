@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import Parameter
 
 from torchspline import checks
 from torchspline.kernels.build import available
@@ -25,6 +26,7 @@ _mode: ContextVar[str | None] = ContextVar("torchspline_kernels", default=None)
 def use_kernels(mode: Mode) -> Iterator[None]:
     """Within the block use compiled kernels where they can ("auto"), must ("fused"), or may not ("reference") run.
 
+    Holds for the thread that entered the block; others follow the environment variable.
     The results are the same up to rounding. "fused" raises `RuntimeError` where a kernel exists but cannot run; calls
     that have none (extrapolation, group operations on few rows, linear maps) use the reference in every mode.
     """
@@ -46,8 +48,10 @@ def usable(*tensors: object) -> bool:
     mode = current()
     if mode == "reference":
         return False
+    seen = tuple(x for x in tensors if isinstance(x, Tensor))
     plain = (
-        all(x.device.type == "cpu" for x in tensors if isinstance(x, Tensor))
+        all(x.device.type == "cpu" and type(x) in (Tensor, Parameter) for x in seen)
+        and not (torch.is_grad_enabled() and any(x.is_inference() for x in seen))
         and not torch.compiler.is_compiling()
         and not transformed()
         and available()
@@ -61,8 +65,13 @@ def usable(*tensors: object) -> bool:
 
 
 def transformed() -> bool:
-    """Whether `torch.func` or forward mode is at work: those need operations they can see."""
-    return torch._C._functorch.peek_interpreter_stack() is not None or forward_ad._current_level >= 0
+    """Whether `torch.func`, forward mode, a tracer or a dispatch mode is at work: they need operations they can see."""
+    return (
+        torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or torch.jit.is_tracing()
+        or torch._C._len_torch_dispatch_stack() > 0
+    )
 
 
 class RefusedError(Exception):

@@ -16,6 +16,8 @@ from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
 
 _NANOSECOND = 1e-9
+#: Largest order times dimension for which a kernel is compiled: beyond, straight-line code takes minutes to compile.
+_SMALL = 64
 
 
 def bspline(
@@ -84,12 +86,14 @@ def bspline(
     fields = None
     # Asked first: Dynamo cannot trace the context variable that `usable` reads.
     eager = not torch.compiler.is_compiling()
-    if eager and extrapolate == "error" and usable(control_points, times, start, spacing):
+    if eager and order * group.tangent_size <= _SMALL and usable(control_points, times, start, spacing):
         kernels = kernels_of(group.name, order, derivatives, control_points.dtype, times.dtype == torch.int64)
         if validate:
             check_float32(times, spacing)
-        fields = fused_bspline(control_points, times, start, spacing, kernels, segments, validate, reference)
-    if fields is None:  # no kernel serves this call, or it met a value which the checks below explain
+        # Kernels know no extrapolation: they refuse times outside, also where nobody asked for checks.
+        refuse = validate or extrapolate != "error"
+        fields = fused_bspline(control_points, times, start, spacing, kernels, segments, refuse, reference)
+    if fields is None:  # no kernel serves this call, or it met a value for the checks or extrapolation below
         if validate:
             _check_values(control_points, group)
             if t.dtype != torch.int64:
@@ -285,6 +289,15 @@ class BSpline(Trajectory):
                 setattr(self, name, before.to(new.device))
         return self
 
+    def get_extra_state(self) -> Tensor:
+        """Whole nanoseconds [t0, dt], zeros for seconds: plain numbers for `torch.compile`, but state all the same."""
+        return torch.tensor([self.t0_ns or 0, self.dt_ns or 0], dtype=torch.int64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Called by `load_state_dict`."""
+        t0_ns, dt_ns = state.tolist()
+        self.t0_ns, self.dt_ns = (t0_ns, dt_ns) if dt_ns else (None, None)
+
     @property
     def domain(self) -> tuple[float, float] | tuple[int, int]:
         """First and last time: seconds, or nanoseconds if made with `dt_ns`."""
@@ -314,8 +327,8 @@ class BSpline(Trajectory):
         )
 
     def extra_repr(self) -> str:
-        start, end = self.domain
         unit = "s" if self.dt_ns is None else "ns"
+        start, end = ("?", "?") if self.control_points.is_meta else self.domain
         batch, points = tuple(self.control_points.shape[:-2]), self.control_points.shape[-2]
         return f"{self.group}, order={self.order}, batch={batch}, points={points}, domain=[{start}, {end}] {unit}"
 

@@ -49,14 +49,13 @@ def locate(
         s = (t.to(torch.float64) - t0) / dt
         segment = s.detach().floor().clamp(0, segments - 1).nan_to_num().to(torch.int64)
         u = s - segment
+    slack = tolerance(t, t0, dt, segments)
+    outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
     if extrapolate != "error":
-        inside = u.clamp(0.0, 1.0)
+        inside = torch.where(outside, u.clamp(0.0, 1.0), u)
         return Located(segment, inside, u - inside)
-    if validate:
-        slack = tolerance(t, t0, dt, segments)
-        outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
-        if not _refuse(outside, t, t0, dt, segments):
-            u = torch.where(outside, torch.nan, u)
+    if validate and not _refuse(outside, t, t0, dt, segments):
+        u = torch.where(outside, torch.nan, u)
     return Located(segment, u, None)
 
 

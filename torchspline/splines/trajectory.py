@@ -148,6 +148,8 @@ class Mounted(Trajectory):
         self.trajectory, self.name = trajectory, name
         self.group = trajectory.group
         self.T_body_sensor: Tensor
+        if not T_body_sensor.requires_grad and not isinstance(T_body_sensor, nn.Parameter):
+            T_body_sensor = T_body_sensor.clone()
         self._keep("T_body_sensor", T_body_sensor)
 
     @property
