@@ -6,6 +6,8 @@ where it belongs. Only the middle loop does arithmetic; two blocks and nothing e
 aliases, which is what lets it use the processor's vectors.
 """
 
+from typing import NamedTuple
+
 import torch
 
 from torchspline.kernels.trace import Trace
@@ -177,25 +179,29 @@ def _locate(nanoseconds: bool) -> list[str]:
     ]
 
 
-_CLOCK = ["times", "shared", "t0", "dt", "tolerance", "segments", "points", "queries", "begin", "stop"]
+_CLOCK = ["times", "shared", "t0", "dt", "tolerance", "segments", "points", "queries"]
+_SPAN = ["begin", "stop"]
 _START = ["outside = 0", "row = begin // queries", "column = begin % queries"]
 
 
-def emit_forward(
-    name: str,
-    program: Trace,
-    point: int,
-    tangent: int,
-    steps: int,
-    derivatives: int,
-    dtype: torch.dtype,
-    ns: bool,
-) -> str:
+class SplineLayout(NamedTuple):
+    """What the loops of a spline are written for: numbers of a point and a tangent, order - 1 steps."""
+
+    point: int
+    tangent: int
+    steps: int
+    derivatives: int
+    dtype: torch.dtype
+    nanoseconds: bool
+
+
+def emit_forward(name: str, program: Trace, layout: SplineLayout) -> str:
     """`name(unit, logs, times, ..., scale, value, rates..., begin, stop)` writes a spline and returns how many times
     lie outside. Program inputs: u, start (point), steps (steps x tangent), scale (derivatives)."""
+    point, tangent, steps, derivatives, dtype, nanoseconds = layout
     rates = [f"rate{r}" for r in range(derivatives)]
     gather = [
-        *_locate(ns),
+        *_locate(nanoseconds),
         "X[i] = real(u)",
         *(f"X[{(1 + c) * BLOCK} + i] = unit[base * {point} + {c}]" for c in range(point)),
         *(f"X[{(1 + point + c) * BLOCK} + i] = logs[base * {tangent} + {c}]" for c in range(steps * tangent)),
@@ -211,29 +217,21 @@ def emit_forward(
         scatter += [
             f"{rate}[(block + i) * {tangent} + {c}] = Y[{(first + c) * BLOCK} + i]" for c in range(tangent)
         ]
-    clock = [*_CLOCK[:8], "scale", "value", *rates, *_CLOCK[8:]]
+    clock = [*_CLOCK, "scale", "value", *rates, *_SPAN]
     parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return outside"]}
     return _source(name, ["unit", "logs", *clock], program, dtype, parts, _SWEEP)
 
 
-def emit_reverse(
-    name: str,
-    program: Trace,
-    point: int,
-    tangent: int,
-    steps: int,
-    derivatives: int,
-    dtype: torch.dtype,
-    ns: bool,
-) -> str:
+def emit_reverse(name: str, program: Trace, layout: SplineLayout) -> str:
     """`name(logs, times, ..., scale, value, value_g, rates_g..., first, start_g, logs_g, u_g, begin, stop)` adds the
     cotangents of queries to those of control points (body frame, from control point `first` on) and pairs.
 
     Program inputs: u, value (point), value cotangent (point), rate cotangents, steps, scale.
     """
+    point, tangent, steps, derivatives, dtype, nanoseconds = layout
     rates = [f"rate_g{r}" for r in range(derivatives)]
     sources = [("value", point), ("value_g", point), *((rate, tangent) for rate in rates)]
-    gather, row = [*_locate(ns), "X[i] = real(u)", "places[i] = base - first"], 1
+    gather, row = [*_locate(nanoseconds), "X[i] = real(u)", "places[i] = base - first"], 1
     for array, size in sources:
         gather += [f"X[{(row + c) * BLOCK} + i] = {array}[(block + i) * {size} + {c}]" for c in range(size)]
         row += size
@@ -252,7 +250,7 @@ def emit_reverse(
         f"u_g[block + i] = Y[{(tangent + count) * BLOCK} + i]",
     ]
     clock = [
-        *_CLOCK[:8],
+        *_CLOCK,
         "scale",
         "value",
         "value_g",
@@ -261,7 +259,7 @@ def emit_reverse(
         "start_g",
         "logs_g",
         "u_g",
-        *_CLOCK[8:],
+        *_SPAN,
     ]
     parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return outside"]}
     return _source(name, ["logs", *clock], program, dtype, parts, _SWEEP)

@@ -222,14 +222,22 @@ class SplineKernels:
 
     def forward_source(self) -> str:
         program = programs.forward_program(self.group, self.rows, self.derivatives, self.dtype)
-        return emit.emit_forward(self._name("forward"), program, *self._sizes(), self.dtype, self.nanoseconds)
+        return emit.emit_forward(self._name("forward"), program, self._layout())
 
     def reverse_source(self) -> str:
         program = programs.reverse_program(self.group, self.rows, self.derivatives, self.dtype)
-        return emit.emit_reverse(self._name("reverse"), program, *self._sizes(), self.dtype, self.nanoseconds)
+        return emit.emit_reverse(self._name("reverse"), program, self._layout())
 
-    def _sizes(self) -> tuple[int, int, int, int]:
-        return self.group.point_size, self.group.tangent_size, self.order - 1, self.derivatives
+    def _layout(self) -> emit.SplineLayout:
+        group = self.group
+        return emit.SplineLayout(
+            group.point_size,
+            group.tangent_size,
+            self.order - 1,
+            self.derivatives,
+            self.dtype,
+            self.nanoseconds,
+        )
 
 
 def _chunk_count(total: int, points: int) -> int:

@@ -37,9 +37,9 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.forget)
 
 
-def run(tasks: Sequence[Callable[[], None]], threads: int | None = None) -> None:
+def run(tasks: Sequence[Callable[[], None]]) -> None:
     """Run all tasks, at most `torch.get_num_threads()` at a time, the caller's thread included."""
-    threads = min(threads or torch.get_num_threads(), len(tasks))
+    threads = min(torch.get_num_threads(), len(tasks))
     if threads <= 1:
         for task in tasks:
             task()
