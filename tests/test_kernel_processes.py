@@ -119,7 +119,7 @@ def compile_square(tmp_path, monkeypatch):
     monkeypatch.setenv(build.CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     program = trace(lambda v: [v[0] * v[0], 0.0], [1], torch.float64)
-    source = emit.emit_rows("square", program, None, [1], [1], torch.float64)
+    source = emit.emit_rows("square", program, None, [1], [], [1], torch.float64)
 
     def compile_square():
         function = build.compiled.__wrapped__("square", source, "(float64[::1], float64[::1], int64, int64)")

@@ -204,7 +204,7 @@ def test_constants_keep_every_bit(constant):
     program = traced(lambda x: x * constant, 1)
     assert evaluate(program, [1.0]) == [float(constant)]
     single = trace(lambda v: [v[0] * constant, 0.0], [1], float32)
-    assert f"real({float(constant)!r})" in emit_rows("f", single, None, [1], [1], float32)
+    assert f"real({float(constant)!r})" in emit_rows("f", single, None, [1], [], [1], float32)
 
 
 def test_a_symbol_has_no_truth_value():

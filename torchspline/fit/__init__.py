@@ -1,4 +1,4 @@
-"""Trajectories from measurements."""
+"""Trajectories and sensor parameters from measurements."""
 
 from torchspline.fit.poses import PoseFit, fit_poses
 

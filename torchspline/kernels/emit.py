@@ -75,17 +75,28 @@ def _source(
 
 
 def emit_rows(
-    name: str, near: Trace, far: Trace | None, sizes: list[int], results: list[int], dtype: torch.dtype
+    name: str,
+    near: Trace,
+    far: Trace | None,
+    sizes: list[int],
+    shared: list[int],
+    results: list[int],
+    dtype: torch.dtype,
 ) -> str:
     """`name(in0, ..., out0, ..., begin, stop)`: row r of every output from row r of every input, flat arrays.
 
-    The last output of the programs is 1 for rows to refuse; how many is returned. A block in which the near program
+    The inputs after those of the given sizes are shared by all rows. The last output of the programs is 1 for rows to refuse; how many is returned. A block in which the near program
     does not hold for some row is done again by the far one.
     """
-    ins, outs = [f"in{i}" for i in range(len(sizes))], [f"out{i}" for i in range(len(results))]
+    ins = [f"in{i}" for i in range(len(sizes) + len(shared))]
+    outs = [f"out{i}" for i in range(len(results))]
     gather, row = [], 0
-    for array, size in zip(ins, sizes, strict=True):
+    for array, size in zip(ins, sizes, strict=False):
         gather += [f"X[{(row + c) * BLOCK} + i] = {array}[(block + i) * {size} + {c}]" for c in range(size)]
+        row += size
+    before = ["refused = 0"]
+    for array, size in zip(ins[len(sizes) :], shared, strict=True):
+        before += [f"X[{(row + c) * BLOCK}:{(row + c + 1) * BLOCK}] = {array}[{c}]" for c in range(size)]
         row += size
     scatter, row = [], 0
     for array, size in zip(outs, results, strict=True):
@@ -103,7 +114,7 @@ def emit_rows(
             *(f"    {line}" for line in _middle(far, dtype == torch.float32)),
         ]
     parts = {
-        "before": ["refused = 0"],
+        "before": before,
         "gather": gather,
         "again": again,
         "scatter": scatter,
@@ -263,3 +274,46 @@ def emit_reverse(name: str, program: Trace, layout: SplineLayout) -> str:
     ]
     parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return outside"]}
     return _source(name, ["logs", *clock], program, dtype, parts, _SWEEP)
+
+
+class Access(NamedTuple):
+    """Numbers `array[start], ..., array[start + size - 1]`, `start` an expression in `item` and what is computed from
+    it."""
+
+    array: str
+    start: str
+    size: int
+
+
+def emit_placed(
+    name: str,
+    program: Trace,
+    parameters: list[str],
+    setup: list[str],
+    inputs: list[Access],
+    shared: list[Access],
+    outputs: list[Access],
+    dtype: torch.dtype,
+) -> str:
+    """`name(*parameters, begin, stop)` for items whose place among the control points is known already.
+
+    `setup` are lines run for every item before its inputs are gathered, and again before its outputs are scattered;
+    program inputs are `inputs`, then `shared`, which are the same for all items.
+    """
+
+    def rows(accesses: list[Access], row: int) -> list[tuple[str, str]]:
+        pairs = []
+        for array, start, size in accesses:
+            pairs += [(f"{(row + c) * BLOCK}", f"{array}[{start} + {c}]") for c in range(size)]
+            row += size
+        return pairs
+
+    own = sum(access.size for access in inputs)
+    before = [f"X[{row}:{row} + {BLOCK}] = {element}" for row, element in rows(shared, own)]
+    begin = ["item = block + i", *setup]
+    parts = {
+        "before": before,
+        "gather": [*begin, *(f"X[{row} + i] = {element}" for row, element in rows(inputs, 0))],
+        "scatter": [*begin, *(f"{element} = Y[{row} + i]" for row, element in rows(outputs, 0))],
+    }
+    return _source(name, [*parameters, *_SPAN], program, dtype, parts, _SWEEP)

@@ -6,9 +6,15 @@ from fractions import Fraction
 import torch
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.recurrence import difference_reverse, forward, parameter_cotangent, reverse
+from torchspline.arithmetic.recurrence import (
+    difference_reverse,
+    difference_tangent,
+    forward,
+    parameter_cotangent,
+    reverse,
+)
 from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, dot, plus, scale, times
+from torchspline.arithmetic.vector import Vector, dot, plus, scale, times, zero
 from torchspline.checks import LONGEST_QUATERNION, SHORTEST_QUATERNION
 from torchspline.kernels.trace import Symbol, Trace, indicator, trace
 
@@ -75,6 +81,42 @@ def reverse_program(
 
     sizes = [1, group.point_size, group.point_size, derivatives * size, count * size, derivatives]
     return trace(run, sizes, dtype)
+
+
+def row_program(
+    group: GroupArithmetic, rows: RationalRows, parts: Sequence[bool], dtype: torch.dtype
+) -> Trace:
+    """One row of a Jacobian. Inputs u, steps, a body cotangent of each of the `parts` (value, velocity, ...) that is
+    True, scale; outputs cotangents of start and steps."""
+    count, size, derivatives = len(rows), group.tangent_size, len(parts) - 1
+
+    def run(u: Vector, steps: Vector, cotangents: Vector, scales: Vector) -> list[Scalar]:
+        weights = _weights(u[0], rows, derivatives)
+        chopped, given = _chop(steps, size), iter(_chop(cotangents, size))
+        start = group.identity()  # what is asked for does not depend on it
+        _, sweep = forward(group, start, chopped, weights, derivatives, short=True)
+        value_g, *rates_g = (next(given) if part else zero(size) for part in parts)
+        scaled = [scale(s, g) for s, g in zip(scales, rates_g, strict=True)]
+        start_g, steps_g, _ = reverse(group, chopped, weights, sweep, value_g, scaled, short=True)
+        return [*start_g, *(c for g in steps_g for c in g)]
+
+    return trace(run, [1, count * size, sum(parts) * size, derivatives], dtype)
+
+
+def pair_jacobian(group: GroupArithmetic, d: Vector) -> list[Scalar]:
+    """The matrices of `difference_tangent`, row by row: how d changes with the first and with the second of a pair."""
+    size = group.tangent_size
+    columns = []
+    for e in (tuple(float(i == j) for i in range(size)) for j in range(size)):
+        columns.append(difference_tangent(group, d, e, zero(size)))
+    for e in (tuple(float(i == j) for i in range(size)) for j in range(size)):
+        columns.append(difference_tangent(group, d, zero(size), e))
+    return [columns[half * size + j][i] for half in (0, 1) for i in range(size) for j in range(size)]
+
+
+def retraction(group: GroupArithmetic, X: Vector, x: Vector) -> Vector:
+    """X Exp(x) for stored X."""
+    return group.normalize(group.compose(group.normalize(X), group.exp(x)))
 
 
 def pairs_program(group: GroupArithmetic, dtype: torch.dtype) -> Trace:

@@ -26,6 +26,7 @@ class RowKernel:
         function: components of the arguments to components of the result, one flat sequence.
         sizes: components of each argument. results: of each output.
         valid: components of the arguments to the condition under which a row is accepted; None accepts all.
+        shared: components of further arguments, each one row that all rows share.
     """
 
     def __init__(
@@ -36,8 +37,10 @@ class RowKernel:
         results: Sequence[int],
         dtype: torch.dtype,
         valid: Callable[..., Scalar] | None = None,
+        shared: Sequence[int] = (),
     ):
         self.function, self.sizes, self.results = function, list(sizes), list(results)
+        self.shared = list(shared)
         self.dtype, self.valid = dtype, valid
         self.real = np.float32 if dtype == torch.float32 else np.float64
         self.name = f"{name}_{self.real.__name__}"
@@ -55,7 +58,8 @@ class RowKernel:
 
     @cached_property
     def _kernel(self) -> Callable:
-        arrays = ", ".join([f"{self.real.__name__}[::1]"] * (len(self.sizes) + len(self.results)))
+        sizes = self.sizes + self.shared
+        arrays = ", ".join([f"{self.real.__name__}[::1]"] * (len(sizes) + len(self.results)))
         return compiled(self.name, self.source(), f"({arrays}, int64, int64)")
 
     def source(self) -> str:
@@ -66,6 +70,7 @@ class RowKernel:
             refused = 0.0 if self.valid is None else 1.0 - indicator(self.valid(*arguments))
             return [*results, refused]
 
-        near = trace(with_verdict, self.sizes, self.dtype, near=True)
-        far = trace(with_verdict, self.sizes, self.dtype) if near.guarded else None
-        return emit.emit_rows(self.name, near, far, self.sizes, self.results, self.dtype)
+        sizes = self.sizes + self.shared
+        near = trace(with_verdict, sizes, self.dtype, near=True)
+        far = trace(with_verdict, sizes, self.dtype) if near.guarded else None
+        return emit.emit_rows(self.name, near, far, self.sizes, self.shared, self.results, self.dtype)

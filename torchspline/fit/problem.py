@@ -1,0 +1,259 @@
+"""A least-squares problem: a trajectory, what was measured of it, and what else is unknown."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.fit.model import Model, Spline, State, Unknown
+from torchspline.fit.residual import Residual
+from torchspline.fit.result import Result
+from torchspline.fit.solver import Options, Trace, minimise
+from torchspline.fit.system import BandSystem, SparseSystem, System
+from torchspline.fit.terms import Term
+from torchspline.fit.variables import Variable
+from torchspline.splines.bspline import BSpline
+
+Array = NDArray[Any]
+#: Beyond these the equations are no band with a narrow border any more, and go to a sparse factorisation.
+_WIDEST_BORDER = 300
+_WIDEST_BAND = 6
+
+
+class Problem:
+    """Unknown control points of `trajectory`, and unknowns of the residuals that are added.
+
+    Args:
+        trajectory: a `BSpline` without a batch, on any group, on the CPU. Solving moves its control points in place.
+    """
+
+    def __init__(self, trajectory: BSpline):
+        _check_spline("trajectory", trajectory)
+        self.trajectory = trajectory
+        self.residuals: list[Residual] = []
+        self._indices: list[dict[str, Array]] = []
+        self._frozen: dict[int, Array | bool] = {}
+        self._unknowns: list[Unknown] = [trajectory]
+
+    # ------------------------------------------------------------------ building
+
+    def add(self, residual: Residual, **index: Tensor) -> Residual:
+        """Add measurements; returns the residual.
+
+        Args:
+            index: for an argument that is a `Variable` of several, such as landmarks, which of them each measurement
+                sees, (N,) int64, by the name of the argument.
+        Raises:
+            TypeError, ValueError: it does not fit the trajectory: group, kind of time, times outside its domain.
+        """
+        checks.instance("residual", residual, Residual, "a residual such as torchspline.fit.Gyroscope")
+        residual.bind(self.trajectory.group)
+        indices = {slot: _index(residual, slot, x) for slot, x in index.items()}
+        for slot, x in residual.arguments.items():
+            if isinstance(x, Variable) and x.value.ndim == 2 and slot not in indices:
+                raise ValueError(
+                    f"{slot}: {x.name} holds several; say which each measurement sees: {slot}=index"
+                )
+        self._check_times(residual)
+        unknowns = [x for x in (*residual.arguments.values(), *residual.clock[:2], residual.clock.delay)
+                    if isinstance(x, (Variable, BSpline))]  # fmt: skip
+        for x in unknowns:
+            self._register(x)
+        self.residuals.append(residual)
+        self._indices.append(indices)
+        return residual
+
+    def _register(self, unknown: Unknown) -> None:
+        if any(x is unknown for x in self._unknowns):
+            return
+        if isinstance(unknown, BSpline):
+            _check_spline("spline", unknown)
+            if (unknown.dt_ns is None) != (self.trajectory.dt_ns is None):
+                raise TypeError(
+                    "spline: expected the trajectory's kind of time, seconds or nanoseconds, for both"
+                )
+        elif any(isinstance(x, Variable) and x.name == unknown.name for x in self._unknowns):
+            raise ValueError(f"variable: a name stands for one unknown, got two called {unknown.name!r}")
+        self._unknowns.append(unknown)
+
+    def _check_times(self, residual: Residual) -> None:
+        t, domain = residual.t.detach(), self.trajectory.domain
+        if (t.dtype == torch.int64) != (self.trajectory.dt_ns is not None):
+            raise TypeError(
+                f"t: {residual.name} has {t.dtype} times; expected those of the trajectory, "
+                f"{'int64 nanoseconds' if self.trajectory.dt_ns is not None else 'float64 seconds'}"
+            )
+        if residual.clock != type(residual.clock)():
+            return  # where they lie on the trajectory is unknown; those outside are left out while they are
+        slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
+        outside = (t < domain[0] - slack) | (t > domain[1] + slack)
+        if bool(outside.any()):
+            raise ValueError(
+                f"t: {int(outside.sum())} of {outside.numel()} times of {residual.name} lie outside the trajectory's "
+                f"domain {list(domain)}, the first is {t[outside][0].item()!r}; leave them out or extend the trajectory"
+            )
+
+    def freeze(self, unknown: Unknown, points: Tensor | None = None) -> None:
+        """Keep an unknown as it is: a `Variable`, or control points of a spline.
+
+        Args:
+            points: which control points stay, (M,) bool; None for all.
+        """
+        if not any(x is unknown for x in self._unknowns):
+            raise ValueError(
+                f"unknown: expected the trajectory or an unknown of a residual that was added, got {unknown!r}"
+            )
+        if isinstance(unknown, Variable):
+            if points is not None:
+                raise ValueError("points: only splines have control points")
+            self._frozen[id(unknown)] = True
+            return
+        count = unknown.control_points.shape[-2]
+        if points is None:
+            points = torch.ones(count, dtype=torch.bool)
+        checks.instance("points", points, Tensor, "a bool tensor")
+        if points.shape != (count,) or points.dtype != torch.bool:
+            raise ValueError(
+                f"points: expected bool of shape ({count},), got {points.dtype} {tuple(points.shape)}"
+            )
+        self._frozen[id(unknown)] = points.cpu().numpy()
+
+    def release(self, unknown: Unknown) -> None:
+        """Undo `freeze`."""
+        self._frozen.pop(id(unknown), None)
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """Unknowns besides splines, by name."""
+        return {x.name: x for x in self._unknowns if isinstance(x, Variable)}
+
+    # ------------------------------------------------------------------ solving
+
+    def solve(
+        self,
+        *,
+        max_iterations: int = 50,
+        cost_tolerance: float = 1e-9,
+        gradient_tolerance: float = 1e-8,
+        damping: float = 1e-5,
+        progress: bool = False,
+    ) -> Result:
+        """Move all unknowns to where the sum of squares is least, by Levenberg-Marquardt.
+
+        Args:
+            max_iterations: steps tried at most.
+            cost_tolerance: stop when a step lowers the cost by less than this share.
+            gradient_tolerance: stop when every unknown is this near to its optimum, in its standard deviations.
+            damping: what to start from, as a share of the diagonal.
+            progress: show a progress bar on a terminal.
+        Returns:
+            Result. Control points and the `value` of variables are replaced in place.
+        Raises:
+            ValueError: nothing to solve, a wrong option, a cost that is not finite.
+        """
+        checks.whole("max_iterations", max_iterations, least=0)
+        for name, x in (("cost_tolerance", cost_tolerance), ("gradient_tolerance", gradient_tolerance)):
+            if checks.finite_number(name, x) < 0:
+                raise ValueError(f"{name}: expected a number that is not negative, got {x}")
+        checks.positive("damping", damping)
+        if not self.residuals:
+            raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
+        options = Options(max_iterations, cost_tolerance, gradient_tolerance, damping)
+        with torch.no_grad(), _bar(progress, max_iterations) as show:
+            linearizer = self.prepare()
+            model = linearizer.model
+            if model.total == 0:
+                raise ValueError("solve: everything is frozen")
+            state, system, trace = minimise(model, model.state(), linearizer, options, show)
+            model.store(state)
+        return Result(linearizer, state, system, trace)
+
+    def prepare(self) -> "Linearizer":
+        """The problem in arrays."""
+        origin = self.trajectory.domain[0]
+        splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
+        variables = [x for x in self._unknowns if isinstance(x, Variable)]
+        model = Model(splines, variables, self._frozen)
+        terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
+        return Linearizer(model, terms)
+
+
+class Linearizer:
+    """From numbers of the unknowns to normal equations."""
+
+    def __init__(self, model: Model, terms: list[Term]):
+        self.model, self.terms = model, terms
+        self.fused = model.trajectory.local.fused
+
+    def __call__(self, state: State) -> System:
+        system = self._empty(state)
+        for term in self.terms:
+            for cost, rows, _ in term.linearize(state):
+                system.cost += cost
+                assert state.chain is not None
+                system.add(rows, state.chain)
+        return system
+
+    def _empty(self, state: State) -> System:
+        """A band as wide as the measurements want it now, or a sparse matrix if that is much wider than one needs."""
+        model = self.model
+        width = narrow = 1
+        for term in self.terms:
+            columns = term.places(state).columns
+            if columns.size == 0:
+                continue
+            spline = np.where(columns < model.band, columns, -1)
+            low = np.where(spline < 0, model.total, spline).min(axis=1)
+            width = max(width, int((spline.max(axis=1) - low).max()) + 1)
+            narrow = max(narrow, columns.shape[1])
+        if width > _WIDEST_BAND * narrow or model.total - model.band > _WIDEST_BORDER:
+            return SparseSystem(model, self.fused)
+        return BandSystem(model, self.fused, width)
+
+
+def _check_spline(name: str, spline: BSpline) -> None:
+    checks.instance(name, spline, BSpline, "a BSpline")
+    points = spline.control_points
+    if points.ndim != 2:
+        raise ValueError(
+            f"{name}: expected one without a batch, got control points of shape {tuple(points.shape)}"
+        )
+    if points.device.type != "cpu":
+        raise ValueError(f"{name}: expected one on the CPU, got {points.device}; move it with .to('cpu')")
+
+
+def _index(residual: Residual, slot: str, x: Any) -> Array:
+    variable = residual.arguments.get(slot)
+    if not isinstance(variable, Variable) or variable.value.ndim != 2:
+        raise ValueError(f"{slot}: only an argument that is a Variable of several takes an index")
+    if not isinstance(x, Tensor) or x.dtype != torch.int64 or x.shape != (len(residual),):
+        raise ValueError(f"{slot}: expected an int64 index of shape ({len(residual)},)")
+    index = x.cpu().numpy()
+    count = variable.value.shape[0]
+    if index.size and (index.min() < 0 or index.max() >= count):
+        raise ValueError(
+            f"{slot}: expected indices from 0 to {count - 1}, got {index.min()} to {index.max()}"
+        )
+    return index
+
+
+@contextmanager
+def _bar(shown: bool, total: int) -> Iterator[Any]:
+    """A function to call after each iteration, with a progress bar on a terminal."""
+    if not shown:
+        yield lambda trace: None
+        return
+    from rich.progress import Progress
+
+    with Progress(transient=True) as bar:
+        task = bar.add_task("solving", total=total)
+
+        def show(trace: Trace) -> None:
+            bar.update(task, completed=len(trace.cost) - 1, description=f"solving, cost {trace.cost[-1]:.6g}")
+
+        yield show

@@ -1,0 +1,130 @@
+"""Levenberg-Marquardt on a problem's unknowns: Marquardt's scaling, damping by gain ratio [Nielsen 1999]."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchspline.fit.model import Model, State
+from torchspline.fit.system import Factor, SingularError, System
+
+Array = NDArray[Any]
+#: Damping is a share of the diagonal, which is taken to be at least this share of its largest element.
+_LEAST_DIAGONAL = 1e-12
+_MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class Options:
+    """When to stop and how to start.
+
+    Args:
+        iterations: at most so many steps are tried.
+        cost: stop when a step lowers the cost by less than this share.
+        gradient: stop when no unknown, moved by itself, could come nearer by more than this many of its own standard
+            deviations (measurements weighted as given).
+        damping: what to start from, as a share of the diagonal.
+    """
+
+    iterations: int = 50
+    cost: float = 1e-9
+    gradient: float = 1e-8
+    damping: float = 1e-5
+
+
+@dataclass
+class Trace:
+    """What happened."""
+
+    cost: list[float] = field(default_factory=list)
+    damping: list[float] = field(default_factory=list)
+    evaluations: int = 0
+    reason: str = ""
+    converged: bool = False
+    seconds: dict[str, float] = field(default_factory=lambda: {"linearize": 0.0, "solve": 0.0, "update": 0.0})
+
+    def spend(self, phase: str, since: float) -> float:
+        """Book the time since `since` and return the time now."""
+        now = perf_counter()
+        self.seconds[phase] += now - since
+        return now
+
+
+def minimise(
+    model: Model,
+    state: State,
+    linearize: Callable[[State], System],
+    options: Options,
+    progress: Callable[[Trace], None],
+) -> tuple[State, System, Trace]:
+    """Unknowns of least cost, the normal equations there, and how it went."""
+    trace, clock = Trace(), perf_counter()
+    system = linearize(state)
+    clock = trace.spend("linearize", clock)
+    trace.evaluations, damping, growth = 1, options.damping, 2.0
+    trace.cost.append(system.cost)
+    trace.damping.append(damping)
+    if not math.isfinite(system.cost):
+        raise ValueError(
+            "solve: the cost is not finite where the solution starts; check measurements and start values"
+        )
+    for _ in range(options.iterations):
+        progress(trace)
+        if _stationary(system, options.gradient):
+            trace.reason, trace.converged = "no unknown could come nearer: the gradient is zero", True
+            return state, system, trace
+        scale = system.diagonal()
+        scale = np.maximum(scale, _LEAST_DIAGONAL * scale.max(initial=0.0))
+        scale[scale == 0.0] = 1.0
+        step = _step(system, damping * scale)
+        clock = trace.spend("solve", clock)
+        gain, candidate, fresh = -1.0, state, system
+        if step is not None:
+            candidate = model.moved(state, step)
+            clock = trace.spend("update", clock)
+            fresh = linearize(candidate)
+            clock = trace.spend("linearize", clock)
+            trace.evaluations += 1
+            expected = 0.5 * float(step @ (damping * scale * step - system.right))
+            gain = (
+                (system.cost - fresh.cost) / expected if math.isfinite(fresh.cost) and expected > 0 else -1.0
+            )
+            if gain <= 0 and expected <= options.cost * system.cost:
+                trace.reason, trace.converged = "no step lowers the cost any more", True
+                return state, system, trace
+        if gain > 0:
+            fall = (system.cost - fresh.cost) / max(system.cost, 1e-300)
+            state, system = candidate, fresh
+            damping, growth = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
+            trace.cost.append(system.cost)
+            trace.damping.append(damping)
+            if fall < options.cost:
+                trace.reason, trace.converged = f"the cost fell by less than {options.cost:g} of itself", True
+                return state, system, trace
+        else:
+            damping, growth = damping * growth, 2 * growth
+            if damping > _MOST_DAMPING:
+                trace.reason = "no step lowers the cost, however small"
+                return state, system, trace
+    trace.reason = f"reached {options.iterations} iterations"
+    return state, system, trace
+
+
+def _step(system: System, damping: Array) -> Array | None:
+    try:
+        factor: Factor = system.factor(damping)
+    except SingularError:
+        return None
+    step = -factor.solve(system.right)
+    return step if np.isfinite(step).all() else None
+
+
+def _stationary(system: System, tolerance: float) -> bool:
+    """Whether every unknown, the others held, is within so many of its standard deviations of its optimum."""
+    diagonal = system.diagonal()
+    moved = np.abs(system.right) > tolerance * np.sqrt(diagonal)
+    return not bool((moved & (diagonal > 0)).any())

@@ -1,0 +1,226 @@
+"""Normal equations of a step: a band with a border in LAPACK storage, or a sparse matrix where the band breaks.
+
+`A` is the part of the splines, `B` its coupling to the border of variables, `C` the border's own part.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchspline.fit.model import Model
+from torchspline.fit.terms import Rows
+from torchspline.kernels.assemble import add_to_band, add_to_blocks
+
+Array = NDArray[Any]
+
+
+class SingularError(Exception):
+    """A matrix that should have been positive definite was not."""
+
+
+class Factor(ABC):
+    """Of a damped system."""
+
+    @abstractmethod
+    def solve(self, right: Array) -> Array:
+        """For right sides `(total,)` or `(total, C)`."""
+
+
+class System(ABC):
+    """`J^T J` and `J^T r`, added up chunk by chunk."""
+
+    def __init__(self, model: Model, fused: bool):
+        self.model, self.fused = model, fused
+        self.right = np.zeros(model.total)
+        self.cost = 0.0
+
+    @abstractmethod
+    def add(self, rows: Rows, chain: Array) -> None:
+        """The rows of a chunk."""
+
+    @abstractmethod
+    def add_dense(self, columns: Array, matrix: Array, right: Array) -> None:
+        """A term that is known as `J^T J` `(n, n)` and `J^T r` of the given columns; -1 is left out."""
+
+    @abstractmethod
+    def diagonal(self) -> Array:
+        """Of `J^T J`."""
+
+    @abstractmethod
+    def factor(self, damping: Array) -> Factor:
+        """Of `J^T J` + diag(damping).
+
+        Raises:
+            SingularError: it is not positive definite.
+        """
+
+    @abstractmethod
+    def multiply(self, x: Array) -> Array:
+        """`J^T J x`."""
+
+
+class BandSystem(System):
+    """Cost of a solution is linear in the length of the trajectory.
+
+    Args:
+        width: how far apart columns of splines may be that a measurement ties together, plus one.
+    """
+
+    def __init__(self, model: Model, fused: bool, width: int):
+        super().__init__(model, fused)
+        n, m = model.band, model.total - model.band
+        self.band = np.zeros((n, min(width, max(n, 1))))
+        self.border, self.corner = np.zeros((n, m)), np.zeros((m, m))
+
+    def add(self, rows: Rows, chain: Array) -> None:
+        group, k = self.model.trajectory.group, self.model.trajectory.order
+        outside = add_to_band(
+            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns,
+            self.band, self.border, self.corner, self.right,
+        )  # fmt: skip
+        if outside:
+            raise AssertionError(f"{outside} products outside a band of {self.band.shape[1]}")
+
+    def add_dense(self, columns: Array, matrix: Array, right: Array) -> None:
+        keep = columns >= 0
+        columns, matrix, right = columns[keep], matrix[np.ix_(keep, keep)], right[keep]
+        np.add.at(self.right, columns, right)
+        i, j = (x.reshape(-1) for x in np.meshgrid(columns, columns, indexing="ij"))
+        value, n = matrix.reshape(-1), len(self.band)
+        inner, mixed, outer = (i < n) & (j <= i), (i >= n) & (j < n), (i >= n) & (j >= n) & (j <= i)
+        np.add.at(self.band, (j[inner], (i - j)[inner]), value[inner])
+        np.add.at(self.border, (j[mixed], i[mixed] - n), value[mixed])
+        np.add.at(self.corner, (i[outer] - n, j[outer] - n), value[outer])
+
+    def diagonal(self) -> Array:
+        return np.concatenate([self.band[:, 0], np.diagonal(self.corner)])
+
+    def factor(self, damping: Array) -> "BandFactor":
+        return BandFactor(self, damping)
+
+    def multiply(self, x: Array) -> Array:
+        n = len(self.band)
+        y, result = x[:n], np.zeros_like(x)
+        for d in range(self.band.shape[1]):
+            part = self.band[: n - d, d]
+            result[d:n] += part * y[: n - d]
+            if d:
+                result[: n - d] += part * y[d:]
+        corner = self.corner + np.tril(self.corner, -1).T
+        result[:n] += self.border @ x[n:]
+        result[n:] = self.border.T @ y + corner @ x[n:]
+        return result
+
+
+class BandFactor(Factor):
+    """A banded Cholesky factor and, for the border, that of the Schur complement `C - B^T A^-1 B`."""
+
+    def __init__(self, system: BandSystem, damping: Array):
+        from scipy.linalg import lapack  # as long to import as the rest of the library
+
+        n, m = len(system.band), len(system.corner)
+        self.n, self._lapack = n, lapack
+        self.damped = system.band.copy()
+        self.damped[:, 0] += damping[:n]
+        self.chol = self.damped.T
+        if n:
+            self.chol, info = lapack.dpbtrf(self.damped.T, lower=1, overwrite_ab=1)
+            if info:
+                raise SingularError
+        self.border = system.border
+        self.inverse_border = self._band_solve(system.border)
+        complement = system.corner + np.diag(damping[n:]) - np.tril(self.border.T @ self.inverse_border)
+        self.corner = complement
+        if m:
+            self.corner, info = lapack.dpotrf(complement, lower=1)
+            if info:
+                raise SingularError
+
+    def _band_solve(self, right: Array) -> Array:
+        if self.n == 0 or right.size == 0:
+            return right
+        return self._lapack.dpbtrs(self.chol, right, lower=1)[0]
+
+    def solve(self, right: Array) -> Array:
+        n = self.n
+        inner = self._band_solve(right[:n])
+        if len(right) == n:
+            return inner
+        outer = right[n:] - self.border.T @ inner
+        outer = self._lapack.dpotrs(self.corner, outer, lower=1)[0]
+        return np.concatenate([inner - self.inverse_border @ outer, outer])
+
+
+class SparseSystem(System):
+    """For distant relative poses and maps of landmarks, whose coupling fits no band."""
+
+    def __init__(self, model: Model, fused: bool):
+        super().__init__(model, fused)
+        self._parts: list[tuple[Array, Array, Array]] = []
+        self._matrix: Any = None
+
+    def add(self, rows: Rows, chain: Array) -> None:
+        group, k = self.model.trajectory.group, self.model.trajectory.order
+        size = rows.columns.shape[1]
+        blocks = np.empty((len(rows.columns), size, size))
+        add_to_blocks(
+            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns, blocks, self.right
+        )
+        i = np.repeat(rows.columns, size, axis=1).reshape(-1)
+        j = np.tile(rows.columns, (1, size)).reshape(-1)
+        self._keep(i, j, blocks.reshape(-1))
+
+    def add_dense(self, columns: Array, matrix: Array, right: Array) -> None:
+        keep = columns >= 0
+        np.add.at(self.right, columns[keep], right[keep])
+        i, j = np.meshgrid(columns, columns, indexing="ij")
+        self._keep(i.reshape(-1), j.reshape(-1), matrix.reshape(-1))
+
+    def _keep(self, i: Array, j: Array, value: Array) -> None:
+        there = (i >= 0) & (j >= 0)
+        self._parts.append((i[there], j[there], value[there]))
+
+    def matrix(self) -> Any:
+        """`J^T J` as a SciPy matrix of compressed columns."""
+        if self._matrix is None:
+            from scipy.sparse import coo_matrix
+
+            i, j, value = (np.concatenate(x) for x in zip(*self._parts, strict=True))
+            total = self.model.total
+            self._matrix = coo_matrix((value, (i, j)), shape=(total, total)).tocsc()
+        return self._matrix
+
+    def diagonal(self) -> Array:
+        return self.matrix().diagonal()
+
+    def factor(self, damping: Array) -> "SparseFactor":
+        return SparseFactor(self.matrix(), damping)
+
+    def multiply(self, x: Array) -> Array:
+        return self.matrix() @ x
+
+
+class SparseFactor(Factor):
+    def __init__(self, matrix: Any, damping: Array):
+        from scipy.sparse import diags
+        from scipy.sparse.linalg import splu
+
+        damped = (matrix + diags(damping)).tocsc()
+        try:
+            # Positive definite: symmetric ordering, no pivoting.
+            self._lu = splu(
+                damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError:
+            raise SingularError from None
+        if not (self._lu.U.diagonal() > 0).all():
+            raise SingularError
+
+    def solve(self, right: Array) -> Array:
+        return self._lu.solve(right)
+
+
+def rows_of(rows: Rows) -> tuple[Array, Array, Array]:
+    return rows.rows, rows.starts, rows.bases

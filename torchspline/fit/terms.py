@@ -1,0 +1,294 @@
+"""One residual inside a problem: its measurements in order of time, and its part of the normal equations."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchspline.fit.kernel import ResidualKernel, kernel_of
+from torchspline.fit.model import NANOSECOND, Model, State
+from torchspline.fit.residual import Residual, square_root_information
+from torchspline.fit.variables import Variable
+from torchspline.splines.bspline import BSpline
+
+Array = NDArray[Any]
+#: Measurements linearised at a time: their rows stay in the cache and memory stays bounded.
+CHUNK = 8192
+
+
+class Places(NamedTuple):
+    """Where measurements lie on the splines, and the runs of those that touch the same unknowns."""
+
+    #: For each moment.
+    base: list[Array]
+    u: list[Array]
+    #: For each argument that is a spline.
+    own_base: dict[str, Array]
+    own_u: dict[str, Array]
+    outside: Array
+    starts: Array
+    #: (runs, moments) and (runs, columns of the rows).
+    bases: Array
+    columns: Array
+    #: Trajectory times (moments, N) and how they move with each unknown of the clock.
+    rates: list[tuple[Variable, Array]]
+
+
+class Rows(NamedTuple):
+    """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
+
+    rows: Array
+    starts: Array
+    bases: Array
+    columns: Array
+
+
+class Term:
+    """A residual bound to the unknowns of a problem."""
+
+    def __init__(self, residual: Residual, model: Model, origin: float | int, index: dict[str, Array]):
+        self.residual, self.model = residual, model
+        kind = type(residual)
+        tau = _seconds(residual.t.detach().cpu().reshape(kind.moments, -1), origin)
+        self.order = np.argsort(tau[0], kind="stable")
+        if np.array_equal(self.order, np.arange(len(self.order))):
+            self.order = np.arange(len(self.order))
+        self.tau = np.ascontiguousarray(tau[:, self.order])
+        self.mid = (
+            float(_seconds(torch.as_tensor(residual.clock.mid), origin)) if residual.clock.skew else 0.0
+        )
+        self.late = None
+        if residual.clock.late is not None:
+            self.late = residual.clock.late.detach().cpu().to(torch.float64).numpy()[self.order]
+        self.measured = residual.measured.detach().cpu().to(torch.float64).numpy()[self.order]
+        self.index = {slot: x[self.order] for slot, x in index.items()}
+        self.weights = self._weights()
+        given = tuple(
+            (slot, isinstance(x, BSpline) or slot in index) for slot, x in residual.arguments.items()
+        )
+        self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
+        self.clock = [
+            v for v in (residual.clock.offset, residual.clock.skew, residual.clock.delay)
+            if v is not None and id(v) in model.columns
+        ]  # fmt: skip
+        self.splines = {
+            slot: next(s for s in model.splines if s.module is x)
+            for slot, x in residual.arguments.items()
+            if isinstance(x, BSpline)
+        }
+        self.movable = [
+            slot
+            for slot in self.kernel.order
+            if isinstance(x := residual.arguments[slot], Variable) and id(x) in model.columns
+        ]
+        self._places: Places | None = None
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def _weights(self) -> Array | None:
+        """Square roots of the information: None, (N or 1, R or 1), or (N or 1, R, R)."""
+        root = square_root_information(self.residual.weighting)
+        if root is None:
+            return None
+        weights = root.detach().cpu().numpy()
+        rows = self.kernel_rows()
+        if weights.ndim < 2 or (weights.shape == (rows, rows) and self.residual.weighting[0] != "sigma"):
+            return weights.reshape(1, *(weights.shape or (1,)))
+        return weights[self.order]
+
+    def kernel_rows(self) -> int:
+        return type(self.residual).sizes(self.model.trajectory.group)[0]
+
+    # ------------------------------------------------------------------ where
+
+    def places(self, state: State) -> Places:
+        """Computed once where the clock is known."""
+        if self._places is not None:
+            return self._places
+        tau, rates = self._times(state)
+        trajectory = self.model.trajectory
+        base, u, outside = map(list, zip(*(trajectory.place(t) for t in tau), strict=True))
+        own_base, own_u, keys = {}, {}, [*base]
+        for slot, spline in self.splines.items():
+            own_base[slot], own_u[slot], _ = spline.place(self.tau[0])
+            keys.append(own_base[slot])
+        keys += self.index.values()
+        starts = _runs(keys, len(self))
+        first = starts[:-1]
+        columns = [
+            self.model.columns[id(trajectory.module)][b[first, None] + np.arange(trajectory.order)]
+            for b in base
+        ]
+        for slot, spline in self.splines.items():
+            windows = own_base[slot][first, None] + np.arange(spline.order)
+            columns.append(self.model.columns[id(spline.module)][windows])
+        for slot in self.movable:
+            own = self.model.columns[id(self.residual.arguments[slot])]
+            rows = self.index[slot][first] if slot in self.index else np.zeros(len(first), np.int64)
+            columns.append(own[rows])
+        columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
+        places = Places(
+            base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
+            np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
+            np.ascontiguousarray(np.concatenate([c.reshape(len(first), -1) for c in columns], axis=1)),
+            rates,
+        )  # fmt: skip
+        if not self.clock:
+            self._places = places
+        return places
+
+    def _times(self, state: State) -> tuple[Array, list[tuple[Variable, Array]]]:
+        """Times of the trajectory, and how they move with the unknowns of the clock."""
+        clock = self.residual.clock
+        number = {
+            v.name: float(state.values[id(v)][0])
+            for v in (clock.offset, clock.skew, clock.delay)
+            if v is not None
+        }
+        value = lambda v: 0.0 if v is None else number[v.name]  # noqa: E731
+        rate = 1.0 + value(clock.skew)
+        late = 0.0 if self.late is None else value(clock.delay) * self.late
+        tau = self.mid + (self.tau - self.mid - value(clock.offset) - late) / rate
+        rates: list[tuple[Variable, Array]] = []
+        for v in self.clock:
+            if v is clock.offset:
+                rates.append((v, np.full_like(tau, -1.0 / rate)))
+            elif v is clock.skew:
+                rates.append((v, -(tau - self.mid) / rate))
+            else:
+                rates.append((v, np.broadcast_to(-self.late / rate, tau.shape)))
+        return tau, rates
+
+    # ------------------------------------------------------------------ what
+
+    def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
+        """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
+        places = self.places(state)
+        for begin, stop, first, last in _chunks(places.starts, CHUNK):
+            cost, rows, residual = self._chunk(state, places, slice(begin, stop))
+            starts = places.starts[first : last + 1] - begin
+            yield cost, Rows(rows, starts, places.bases[first:last], places.columns[first:last]), residual
+
+    def _chunk(self, state: State, places: Places, part: slice) -> tuple[float, Array, Array]:
+        model, kernel = self.model, self.kernel
+        spline, local = model.trajectory, state.local
+        assert local is not None
+        derivatives = type(self.residual).derivatives + (1 if self.clock else 0)
+        base, u = [b[part] for b in places.base], [x[part] for x in places.u]
+        states = [spline.local.evaluate(local, b, x, derivatives) for b, x in zip(base, u, strict=True)]
+        kept = type(self.residual).derivatives + 1
+        arrays = [x for s in states for x in s[:kept]] + [self.measured[part]]
+        arrays += [self._argument(slot, state, places, part) for slot in kernel.order]
+        residual, *cotangents = kernel.linearize(arrays, spline.local.fused)
+        moments, slots = cotangents[: len(base)], cotangents[len(base) :]
+        times = [
+            sum(np.einsum("nrc,nc->nr", g, _pick(s[1:], parts)) * rate[m, part][:, None]
+                for m, (g, s, parts) in enumerate(zip(moments, states, kernel.parts, strict=True)))
+            for _, rate in places.rates
+        ]  # fmt: skip
+        width = places.columns.shape[1] + 1
+        N, R = residual.shape
+        rows = np.empty((N, R, width))
+        error, weight, cost = self._weigh(residual, part, places.outside[part])
+        rows[..., -1] = error
+        at = 0
+        for g, b, x, parts in zip(moments, base, u, kernel.parts, strict=True):
+            spline.local.rows(local, b, x, _apply(weight, g), parts, rows, at)
+            at += spline.local.width
+        for slot, own in self.splines.items():
+            g = _apply(weight, slots[kernel.order.index(slot)])
+            block = own.blending(places.own_u[slot][part])[:, None, :, None] * g[:, :, None, :]
+            rows[..., at : at + own.order * own.size] = block.reshape(N, R, -1)
+            at += own.order * own.size
+        for slot in self.movable:
+            variable = self.residual.arguments[slot]
+            assert isinstance(variable, Variable)
+            g = _apply(weight, slots[kernel.order.index(slot)])
+            basis = variable.basis(state.values[id(variable)])
+            if basis is not None:
+                each = basis.numpy()[self.index[slot][part]] if slot in self.index else basis.numpy()
+                g = g @ each
+            rows[..., at : at + variable.dimension] = g
+            at += variable.dimension
+        for column in times:
+            rows[..., at] = _apply(weight, column[..., None])[..., 0]
+            at += 1
+        return cost, rows, residual
+
+    def _argument(self, slot: str, state: State, places: Places, part: slice) -> Array:
+        """Numbers of an argument: one for all measurements, or one each."""
+        x = self.residual.arguments[slot]
+        if isinstance(x, BSpline):
+            spline = self.splines[slot]
+            points = state.points[id(x)][places.own_base[slot][part, None] + np.arange(spline.order)]
+            return np.einsum("nk,nkd->nd", spline.blending(places.own_u[slot][part]), points)
+        value = (
+            state.values[id(x)].numpy()
+            if isinstance(x, Variable)
+            else x.detach().cpu().to(torch.float64).numpy()
+        )
+        return value[self.index[slot][part]] if slot in self.index else value.reshape(-1)
+
+    def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, float]:
+        """Weighted residual, the weights its Jacobian takes as well, and the cost."""
+        weight = self.weights
+        if weight is not None and weight.shape[0] > 1:
+            weight = weight[part]
+        error = residual if weight is None else _apply(weight, residual[..., None])[..., 0]
+        squared = np.einsum("nr,nr->n", error, error)
+        loss = self.residual.loss
+        if loss is None and not outside.any():
+            return error, weight, 0.5 * float(squared.sum())
+        s = torch.from_numpy(squared)
+        rho, slope = (
+            (squared, np.ones_like(squared))
+            if loss is None
+            else (loss.rho(s).numpy(), loss.weight(s).numpy())
+        )
+        inside = ~outside
+        root = (np.sqrt(slope) * inside)[:, None]
+        if weight is None or weight.ndim == 2:
+            weight = root if weight is None else weight * root
+        else:
+            weight = weight * root[..., None]
+        return error * root, weight, 0.5 * float((rho * inside).sum())
+
+
+def _apply(weight: Array | None, g: Array) -> Array:
+    """W g for rows g (N, R, C) and W as in `Term._weights`."""
+    if weight is None:
+        return g
+    return weight[..., None] * g if weight.ndim == 2 else weight @ g
+
+
+def _pick(rates: list[Array], parts: tuple[bool, ...]) -> Array:
+    """The rates of the parts of a state that a residual depends on, side by side."""
+    return np.concatenate([rate for rate, part in zip(rates, parts, strict=False) if part], axis=1)
+
+
+def _runs(keys: list[Array], count: int) -> Array:
+    """Where a run begins of measurements that agree in all keys, and `count`."""
+    change = np.zeros(max(count - 1, 0), bool)
+    for key in keys:
+        change |= key[1:] != key[:-1]
+    inner = np.flatnonzero(change) + 1
+    return np.concatenate([np.zeros(min(count, 1), np.int64), inner, [count]]).astype(np.int64)
+
+
+def _chunks(starts: Array, size: int) -> Iterator[tuple[int, int, int, int]]:
+    """Whole runs of about `size` measurements at a time: first and last measurement, first and last run."""
+    first, runs = 0, len(starts) - 1
+    while first < runs:
+        last = int(np.searchsorted(starts, starts[first] + size, side="right")) - 1
+        last = min(max(last, first + 1), runs)
+        yield int(starts[first]), int(starts[last]), first, last
+        first = last
+
+
+def _seconds(t: torch.Tensor, origin: float | int) -> Array:
+    if t.dtype == torch.int64:
+        return (t - int(origin)).numpy().astype(np.float64) * NANOSECOND
+    return (t.to(torch.float64) - origin).numpy()
