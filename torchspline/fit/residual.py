@@ -247,7 +247,7 @@ def _weighting(
 
 
 def square_root_information(weighting: tuple[str, Tensor | None]) -> Tensor | None:
-    """W with W^T W the information: None for one, (...,) or (..., R) factors, or (..., R, R) matrices. Differentiable."""
+    """W with W^T W the information: None for one, factors (...,) or (..., R), or matrices (..., R, R)."""
     kind, x = weighting
     if x is None:
         return None

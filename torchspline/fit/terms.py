@@ -159,6 +159,7 @@ class Term:
             elif v is clock.skew:
                 rates.append((v, -(tau - self.mid) / rate))
             else:
+                assert self.late is not None
                 rates.append((v, np.broadcast_to(-self.late / rate, tau.shape)))
         return tau, rates
 

@@ -23,8 +23,9 @@ from numba import njit
 DEPTH = {DEPTH}
 
 '''
-_HELPER = '@njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})\n'
-_ENTRY = '@njit("{signature}", nogil=True, cache={cache}, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})\n'
+_OPTIONS = 'nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}'
+_ENTRY = '@njit("{signature}", cache={cache}, ' + _OPTIONS + ")\n"
+_HELPER = f"@njit({_OPTIONS})\n"
 
 
 #: Rows of a run that are multiplied at a time.
