@@ -80,7 +80,8 @@ def test_worked_example_of_the_docstring():
     still = ts.BSpline(SO3.identity(6), group=SO3, order=4, dt=0.5)
     jacobians = still.jacobians(torch.tensor(0.25, dtype=float64), derivatives=1)
     weights = torch.tensor([1.0, 23.0, 23.0, 1.0], dtype=float64) / 48
-    assert_allclose(jacobians.value, weights[:, None, None] * torch.eye(3), atol=1e-14)
+    expected = weights[:, None, None] * torch.eye(3, dtype=float64)
+    assert_allclose(jacobians.value, expected, atol=1e-14)
     assert jacobians.first.shape == ()
     assert jacobians.acceleration is None
 

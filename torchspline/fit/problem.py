@@ -1,7 +1,6 @@
 """A least-squares problem: a trajectory, what was measured of it, and what else is unknown."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.fit.bends import Bends
 from torchspline.fit.model import Model, Spline, State, Unknown
+from torchspline.fit.progress import progress_bar
 from torchspline.fit.residual import Residual
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, Trace, minimise
+from torchspline.fit.solver import Options, minimise
 from torchspline.fit.system import BandSystem, SparseSystem, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
@@ -164,7 +165,7 @@ class Problem:
         if not self.residuals:
             raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
         options = Options(max_iterations, cost_tolerance, gradient_tolerance, damping)
-        with torch.no_grad(), _bar(progress, max_iterations) as show:
+        with torch.no_grad(), progress_bar(progress, max_iterations) as show:
             linearizer = self.prepare()
             model = linearizer.model
             if model.total == 0:
@@ -186,8 +187,8 @@ class Problem:
 class Linearizer:
     """From numbers of the unknowns to normal equations."""
 
-    def __init__(self, model: Model, terms: list[Term]):
-        self.model, self.terms = model, terms
+    def __init__(self, model: Model, terms: Sequence[Term | Bends]):
+        self.model, self.terms = model, list(terms)
         self.fused = model.trajectory.local.fused
 
     def __call__(self, state: State) -> System:
@@ -204,7 +205,7 @@ class Linearizer:
         model = self.model
         width = narrow = 1
         for term in self.terms:
-            columns = term.places(state).columns
+            columns = term.touched(state)
             if columns.size == 0:
                 continue
             spline = np.where(columns < model.band, columns, -1)
@@ -240,20 +241,3 @@ def _index(residual: Residual, slot: str, x: Any) -> Array:
             f"{slot}: expected indices from 0 to {count - 1}, got {index.min()} to {index.max()}"
         )
     return index
-
-
-@contextmanager
-def _bar(shown: bool, total: int) -> Iterator[Any]:
-    """A function to call after each iteration, with a progress bar on a terminal."""
-    if not shown:
-        yield lambda trace: None
-        return
-    from rich.progress import Progress
-
-    with Progress(transient=True) as bar:
-        task = bar.add_task("solving", total=total)
-
-        def show(trace: Trace) -> None:
-            bar.update(task, completed=len(trace.cost) - 1, description=f"solving, cost {trace.cost[-1]:.6g}")
-
-        yield show

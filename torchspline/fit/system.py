@@ -75,9 +75,8 @@ class BandSystem(System):
         self.border, self.corner = np.zeros((n, m)), np.zeros((m, m))
 
     def add(self, rows: Rows, chain: Array) -> None:
-        group, k = self.model.trajectory.group, self.model.trajectory.order
         outside = add_to_band(
-            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns,
+            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns,
             self.band, self.border, self.corner, self.right,
         )  # fmt: skip
         if outside:
@@ -162,11 +161,10 @@ class SparseSystem(System):
         self._matrix: Any = None
 
     def add(self, rows: Rows, chain: Array) -> None:
-        group, k = self.model.trajectory.group, self.model.trajectory.order
         size = rows.columns.shape[1]
         blocks = np.empty((len(rows.columns), size, size))
         add_to_blocks(
-            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns, blocks, self.right
+            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns, blocks, self.right
         )
         i = np.repeat(rows.columns, size, axis=1).reshape(-1)
         j = np.tile(rows.columns, (1, size)).reshape(-1)

@@ -43,6 +43,8 @@ class Rows(NamedTuple):
     starts: Array
     bases: Array
     columns: Array
+    #: Control points that a row's local coordinates span.
+    span: int
 
 
 class Term:
@@ -165,13 +167,18 @@ class Term:
 
     # ------------------------------------------------------------------ what
 
+    def touched(self, state: State) -> Array:
+        """Columns of the unknowns of each run."""
+        return self.places(state).columns
+
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
-        places = self.places(state)
+        places, span = self.places(state), self.model.trajectory.order
         for begin, stop, first, last in _chunks(places.starts, CHUNK):
             cost, rows, residual = self._chunk(state, places, slice(begin, stop))
             starts = places.starts[first : last + 1] - begin
-            yield cost, Rows(rows, starts, places.bases[first:last], places.columns[first:last]), residual
+            part = Rows(rows, starts, places.bases[first:last], places.columns[first:last], span)
+            yield cost, part, residual
 
     def _chunk(self, state: State, places: Places, part: slice) -> tuple[float, Array, Array]:
         model, kernel = self.model, self.kernel

@@ -367,7 +367,7 @@ class BSpline(Trajectory):
                 points, place.segment, place.u, self.group, self.order, float(seconds), derivatives, side
             )
         rank = len(points.shape[:-2]) + 1
-        return Jacobians(*(None if x is None else x.reshape(*shape, *x.shape[rank:]) for x in result))  # type: ignore[arg-type]
+        return Jacobians(*(None if x is None else x.reshape((*shape, *x.shape[rank:])) for x in result))  # type: ignore[arg-type]
 
     def extra_repr(self) -> str:
         unit = "s" if self.dt_ns is None else "ns"

@@ -25,8 +25,8 @@ class Jacobians(NamedTuple):
 
     For each of `value`, `velocity`, `acceleration`, `jerk` a tensor (*batch, N, k, D, D): entry [..., j, r, c] is the
     change of component r when control point `first + j` moves by a small multiple of tangent direction c:
-    `Exp(delta) X_j` on the left side, `X_j Exp(delta)` on the right. The rows of `value` are a tangent of the same side;
-    those of the derivatives are plain changes, as derivatives are vectors of the body frame either way.
+    `Exp(delta) X_j` on the left side, `X_j Exp(delta)` on the right. The rows of `value` are a tangent of the same
+    side; those of the derivatives are plain changes, as derivatives are vectors of the body frame either way.
     """
 
     #: (*batch, N): the first control point a query depends on.
@@ -35,7 +35,8 @@ class Jacobians(NamedTuple):
     velocity: Tensor | None
     acceleration: Tensor | None
     jerk: Tensor | None
-    #: (*batch, N, 1 + derivatives, D): change with t, per second, of the value (tangent of its side) and the derivatives.
+    #: (*batch, N, 1 + derivatives, D): change with t, per second, of the value (tangent of its side) and the
+    #: derivatives.
     time: Tensor
 
 
@@ -78,7 +79,7 @@ def bspline_jacobians(
         time[:, 0] = group.adjoint_act(value, time[:, 0], validate=False)
     fields += [None] * (4 - len(fields))
     first = segment.expand(*batch, N)
-    return Jacobians(first, *fields, time.reshape(*batch, N, derivatives + 1, D))  # type: ignore[arg-type]
+    return Jacobians(first, *fields, time.reshape(*batch, N, derivatives + 1, D))  # type: ignore[arg-type, call-arg]
 
 
 def _by_time(spline: LocalSpline, local: Local, base: np.ndarray, u: np.ndarray, derivatives: int) -> Tensor:
