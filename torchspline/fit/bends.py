@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchspline.fit.model import Model, State
-from torchspline.fit.terms import CHUNK, Rows
+from torchspline.fit.system import Rows, System
+from torchspline.fit.terms import CHUNK
 
 Array = NDArray[Any]
 
@@ -36,6 +37,13 @@ class Bends:
     def touched(self, state: State) -> Array:
         """Columns of the unknowns of each run."""
         return self.columns
+
+    def add_to(self, system: System, state: State) -> None:
+        """Add cost and normal equations."""
+        assert state.chain is not None
+        for cost, rows, _ in self.linearize(state):
+            system.cost += cost
+            system.add(rows, state.chain)
 
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows and residuals, chunk by chunk."""

@@ -11,8 +11,9 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.fit.bends import Bends
 from torchspline.fit.model import Model, Spline, State, Unknown
+from torchspline.fit.priors import BoundPrior, Part, Prior
 from torchspline.fit.progress import progress_bar
-from torchspline.fit.residual import Residual
+from torchspline.fit.residual import Residual, square_root_information, weighting_of
 from torchspline.fit.result import Result
 from torchspline.fit.solver import Options, minimise
 from torchspline.fit.system import BandSystem, SparseSystem, System
@@ -40,6 +41,7 @@ class Problem:
         self._indices: list[dict[str, Array]] = []
         self._frozen: dict[int, Array | bool] = {}
         self._unknowns: list[Unknown] = [trajectory]
+        self._priors: list[Prior] = []
 
     # ------------------------------------------------------------------ building
 
@@ -98,6 +100,38 @@ class Problem:
                 f"t: {int(outside.sum())} of {outside.numel()} times of {residual.name} lie outside the trajectory's "
                 f"domain {list(domain)}, the first is {t[outside][0].item()!r}; leave them out or extend the trajectory"
             )
+
+    def add_prior(
+        self,
+        variable: Variable,
+        *,
+        sigma: Tensor | float | None = None,
+        covariance: Tensor | None = None,
+        information: Tensor | None = None,
+    ) -> None:
+        """Say beforehand how far a variable may be from where it stands now.
+
+        Args:
+            variable: any, also one that a residual added later depends on; each of several by itself.
+            sigma: standard deviation of its steps (a body tangent, plain numbers, or two angles of a direction, rad):
+                a number or (dimension,). covariance, information: instead, (dimension, dimension).
+        Raises:
+            TypeError, ValueError: a wrong type, shape or value, or none of the three.
+        """
+        checks.instance("variable", variable, Variable, "a torchspline.fit.Variable")
+        if sigma is None and covariance is None and information is None:
+            raise ValueError("sigma, covariance, information: expected one of them, got none")
+        size, count = variable.dimension, variable.value.shape[:-1].numel()
+        root = square_root_information(weighting_of(sigma, covariance, information, size, count))
+        assert root is not None
+        root = root.detach().cpu()
+        matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
+        if matrix.shape != (size, size):
+            raise ValueError(f"sigma: expected a number or shape ({size},), got one for each of several")
+        self._register(variable)
+        reference = variable.points(variable.value).reshape(count, -1)
+        H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
+        self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
 
     def freeze(self, unknown: Unknown, points: Tensor | None = None) -> None:
         """Keep an unknown as it is: a `Variable`, or control points of a spline.
@@ -181,23 +215,20 @@ class Problem:
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, self._frozen)
         terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
-        return Linearizer(model, terms)
+        return Linearizer(model, [*terms, *(prior.bind(model) for prior in self._priors)])
 
 
 class Linearizer:
     """From numbers of the unknowns to normal equations."""
 
-    def __init__(self, model: Model, terms: Sequence[Term | Bends]):
+    def __init__(self, model: Model, terms: Sequence[Term | Bends | BoundPrior]):
         self.model, self.terms = model, list(terms)
         self.fused = model.trajectory.local.fused
 
     def __call__(self, state: State) -> System:
         system = self._empty(state)
         for term in self.terms:
-            for cost, rows, _ in term.linearize(state):
-                system.cost += cost
-                assert state.chain is not None
-                system.add(rows, state.chain)
+            term.add_to(system, state)
         return system
 
     def _empty(self, state: State) -> System:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torchspline.fit.kernel import ResidualKernel, kernel_of
 from torchspline.fit.model import NANOSECOND, Model, State
 from torchspline.fit.residual import Residual, square_root_information
+from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 
@@ -34,17 +35,6 @@ class Places(NamedTuple):
     columns: Array
     #: Trajectory times (moments, N) and how they move with each unknown of the clock.
     rates: list[tuple[Variable, Array]]
-
-
-class Rows(NamedTuple):
-    """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
-
-    rows: Array
-    starts: Array
-    bases: Array
-    columns: Array
-    #: Control points that a row's local coordinates span.
-    span: int
 
 
 class Term:
@@ -170,6 +160,13 @@ class Term:
     def touched(self, state: State) -> Array:
         """Columns of the unknowns of each run."""
         return self.places(state).columns
+
+    def add_to(self, system: System, state: State) -> None:
+        """Add cost and normal equations."""
+        assert state.chain is not None
+        for cost, rows, _ in self.linearize(state):
+            system.cost += cost
+            system.add(rows, state.chain)
 
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
