@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit.bends import Bends
+from torchspline.fit.implicit import differentiable as of_solution
 from torchspline.fit.model import Model, Spline, State, Unknown
 from torchspline.fit.priors import BoundPrior, Part, Prior
 from torchspline.fit.progress import progress_bar
@@ -176,6 +177,7 @@ class Problem:
         cost_tolerance: float = 1e-9,
         gradient_tolerance: float = 1e-8,
         damping: float = 1e-5,
+        differentiable: bool = False,
         progress: bool = False,
     ) -> Result:
         """Move all unknowns to where the sum of squares is least, by Levenberg-Marquardt.
@@ -185,6 +187,10 @@ class Problem:
             cost_tolerance: stop when a step lowers the cost by less than this share.
             gradient_tolerance: stop when every unknown is this near to its optimum, in its standard deviations.
             damping: what to start from, as a share of the diagonal.
+            differentiable: let `result.control_points` and `result.values` carry gradients, by the implicit function
+                theorem, to every tensor with `requires_grad` among times, measurements, standard deviations,
+                covariances and known arguments. Once: not for second derivatives. Gradients are as exact as the
+                solution, so ask for small tolerances.
             progress: show a progress bar on a terminal.
         Returns:
             Result. Control points and the `value` of variables are replaced in place.
@@ -206,7 +212,8 @@ class Problem:
                 raise ValueError("solve: everything is frozen")
             state, system, trace = minimise(model, model.state(), linearizer, options, show)
             model.store(state)
-        return Result(linearizer, state, system, trace)
+        numbers = of_solution(linearizer, state, system) if differentiable else None
+        return Result(linearizer, state, system, trace, numbers)
 
     def prepare(self) -> "Linearizer":
         """The problem in arrays."""

@@ -46,8 +46,22 @@ class Direction:
 class Result:
     """Of `Problem.solve`. Covariances hold at the solution, for the standard deviations that were given."""
 
-    def __init__(self, linearizer: "Linearizer", state: State, system: System, trace: Trace):
+    def __init__(
+        self,
+        linearizer: "Linearizer",
+        state: State,
+        system: System,
+        trace: Trace,
+        numbers: dict[int, Tensor] | None,
+    ):
         self._linearizer, self._state, self._system = linearizer, state, system
+        model = linearizer.model
+        if numbers is None:
+            points = {key: torch.from_numpy(x).clone() for key, x in state.points.items()}
+            numbers = points | {key: x.clone() for key, x in state.values.items()}
+        #: The trajectory's control points, unit, and the variables' values by name; with a graph if so asked.
+        self.control_points = numbers[id(model.trajectory.module)]
+        self.values = {v.name: numbers[id(v)] for v in model.variables}
         #: Half the (robust) weighted sum of squares at the start and after each accepted step.
         self.cost = list(trace.cost)
         #: Damping along with it.
