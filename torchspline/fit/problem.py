@@ -60,8 +60,11 @@ class Problem:
                     f"{slot}: {x.name} holds several; say which each measurement sees: {slot}=index"
                 )
         self._check_times(residual)
-        unknowns = [x for x in (*residual.arguments.values(), *residual.clock[:2], residual.clock.delay)
-                    if isinstance(x, (Variable, BSpline))]  # fmt: skip
+        unknowns = [
+            x
+            for x in (*residual.arguments.values(), *residual.clock.unknowns)
+            if isinstance(x, (Variable, BSpline))
+        ]
         for x in unknowns:
             self._register(x)
         self.residuals.append(residual)
@@ -88,7 +91,7 @@ class Problem:
                 f"t: {residual.name} has {t.dtype} times; expected those of the trajectory, "
                 f"{'int64 nanoseconds' if self.trajectory.dt_ns is not None else 'float64 seconds'}"
             )
-        if residual.clock != type(residual.clock)():
+        if residual.clock.unknowns:
             return  # where they lie on the trajectory is unknown; those outside are left out while they are
         slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
         outside = (t < domain[0] - slack) | (t > domain[1] + slack)

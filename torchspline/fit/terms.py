@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import NANOSECOND, Model, State
+from torchspline.fit.model import NANOSECOND, Model, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
@@ -56,23 +56,24 @@ class Term:
         if np.array_equal(self.order, np.arange(len(self.order))):
             self.order = np.arange(len(self.order))
         self.tau = np.ascontiguousarray(tau[:, self.order])
-        self.mid = (
-            float(_seconds(torch.as_tensor(residual.clock.mid), origin)) if residual.clock.skew else 0.0
-        )
+        mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing
+        self.mid = 0.5 * length if mid is None else seconds(mid, origin)
         self.late = None
         if residual.clock.late is not None:
             self.late = residual.clock.late.detach().cpu().to(torch.float64).numpy()[self.order]
         self.measured = residual.measured.detach().cpu().to(torch.float64).numpy()[self.order]
         self.index = {slot: x[self.order] for slot, x in index.items()}
         self.weights = self._weights()
+        #: Known arguments of which each measurement has its own.
+        self.each = {
+            slot for slot, x in residual.arguments.items() if isinstance(x, torch.Tensor) and x.ndim == 2
+        }
         given = tuple(
-            (slot, isinstance(x, BSpline) or slot in index) for slot, x in residual.arguments.items()
+            (slot, isinstance(x, BSpline) or slot in index or slot in self.each)
+            for slot, x in residual.arguments.items()
         )
         self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
-        self.clock = [
-            v for v in (residual.clock.offset, residual.clock.skew, residual.clock.delay)
-            if v is not None and id(v) in model.columns
-        ]  # fmt: skip
+        self.clock = [v for v in residual.clock.unknowns if id(v) in model.columns]
         self.splines = {
             slot: next(s for s in model.splines if s.module is x)
             for slot, x in residual.arguments.items()
@@ -143,11 +144,7 @@ class Term:
     def _times(self, state: State) -> tuple[Array, list[tuple[Variable, Array]]]:
         """Times of the trajectory, and how they move with the unknowns of the clock."""
         clock = self.residual.clock
-        number = {
-            v.name: float(state.values[id(v)][0])
-            for v in (clock.offset, clock.skew, clock.delay)
-            if v is not None
-        }
+        number = {v.name: float(state.values[id(v)][0]) for v in clock.unknowns}
         value = lambda v: 0.0 if v is None else number[v.name]  # noqa: E731
         rate = 1.0 + value(clock.skew)
         late = 0.0 if self.late is None else value(clock.delay) * self.late
@@ -159,6 +156,7 @@ class Term:
             elif v is clock.skew:
                 rates.append((v, -(tau - self.mid) / rate))
             else:
+                assert self.late is not None
                 rates.append((v, np.broadcast_to(-self.late / rate, tau.shape)))
         return tau, rates
 
@@ -230,6 +228,8 @@ class Term:
             if isinstance(x, Variable)
             else x.detach().cpu().to(torch.float64).numpy()
         )
+        if slot in self.each:
+            return value[self.order[part]]
         return value[self.index[slot][part]] if slot in self.index else value.reshape(-1)
 
     def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, float]:
