@@ -64,6 +64,7 @@ def smoothness(
         t = torch.from_numpy(start + u * spacing)
     share = np.sqrt(np.tile(weights, segments) * 0.5 * spacing)
     measured = torch.zeros(len(u), size, dtype=torch.float64)
-    return _KINDS[derivative - 1](
-        t, measured, sigma=sigma.to(torch.float64) / torch.from_numpy(share)[:, None], name=name
-    )
+    factors = sigma.to(torch.float64) / torch.from_numpy(share)[:, None]
+    residual = _KINDS[derivative - 1](t, measured, sigma=factors, name=name)
+    residual.bind(trajectory.group)
+    return residual
