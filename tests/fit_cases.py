@@ -1,10 +1,14 @@
 """States, arguments and measurements for every kind of residual, for the tests of fitting."""
 
+import numpy as np
+import pytest
 import torch
 from batteries import generator, normal, tangents
+from spline_cases import control_points
 from torch import Tensor
 
-from torchspline import SE3, SO3, Group
+from torchspline import R3, SE3, SO3, BSpline, Group, product
+from torchspline.fit import Problem, Variable
 from torchspline.fit.kernel import ResidualKernel
 from torchspline.fit.residual import Residual
 from torchspline.fit.residuals import RESIDUALS
@@ -23,6 +27,9 @@ def accepts(kind: type[Residual], group: Group) -> bool:
 
 #: Every kind of residual on every group it makes sense on.
 PAIRS = [(kind, group) for kind in RESIDUALS.values() for group in CANDIDATES if accepts(kind, group)]
+
+
+each_pair = pytest.mark.parametrize(("kind", "group"), PAIRS, ids=lambda x: getattr(x, "__name__", str(x)))
 
 
 def of_slot(kind: type[Residual], slot: str, count: int, seed: int = 0) -> Tensor:
@@ -103,3 +110,75 @@ def moved(kind: type[Residual], group: Group, given: dict[str, Tensor], steps: d
 def near(group: Group, angle: float, count: int, seed: int) -> Tensor:
     """Tangents that turn by an angle."""
     return tangents(group, [angle], each=count, seed=seed)
+
+
+def kernel_for(kind, group, slots, own=True):
+    """The kernel that is given these slots, of each measurement its own or of all the same."""
+    return ResidualKernel(kind, group.name, tuple((slot, own) for slot in slots))
+
+
+def equidistant(x, y, z, k1, k2, k3, k4):
+    """OpenCV, fisheye, with the angle by atan2."""
+    r = np.hypot(x, y)
+    angle = np.arctan2(r, z)
+    distorted = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    return distorted * x / r, distorted * y / r
+
+
+SPLIT = product(R3, SO3)
+
+
+def trajectory(group=SE3, count=12, order=4, dt=0.3, gap=0.4, seed=3, **options):
+    if "dt_ns" not in options:
+        options["dt"] = dt
+    return BSpline(control_points(group, count, gap=gap, seed=seed), group=group, order=order, **options)
+
+
+def spread(spline, count, seed=0, margin=0.03):
+    """Times in the domain in no order, the first two of them equal."""
+    low, high = spline.domain
+    u = margin + (1 - 2 * margin) * torch.rand(count, generator=generator(seed), dtype=torch.float64)
+    u[1] = u[0]
+    if spline.dt_ns is not None:
+        return low + (u * (high - low)).to(torch.int64)
+    return low + u * (high - low)
+
+
+def measurements(kind, spline, count, seed=0):
+    """Times, and measurements that are wrong by about as much as they are large."""
+    made = sample(kind, spline.group, count, seed)
+    t = spread(spline, count * kind.moments, seed)
+    return t if kind.moments == 1 else t.reshape(kind.moments, count), made["measured"]
+
+
+def unknown(kind, slot, spline, t, seed=0):
+    """A variable for a slot, at a place where the residual makes sense."""
+    value = of_slot(kind, slot, 1, seed)[0]
+    group = kind.slots[slot].group
+    if slot == "landmark" and "intrinsics" in kind.slots:
+        with torch.no_grad():
+            pose = poses(spline.group, spline(t))
+        value = before_the_camera(pose, SE3.identity(len(t)), seed)
+    return Variable(slot, value, group=None if group is None else Group(group))
+
+
+def build(kind, group, count=7, **options):
+    spline = trajectory(group)
+    t, measured = measurements(kind, spline, count)
+    arguments = {slot: unknown(kind, slot, spline, t) for slot in kind.slots}
+    index = {}
+    if "landmark" in arguments and arguments["landmark"].value.ndim == 2:
+        index["landmark"] = torch.arange(count)
+        arguments["T_body_camera"].value = SE3.exp(0.01 * normal(6, seed=1))
+    problem = Problem(spline)
+    problem.add(kind(t, measured, **arguments, **options), **index)
+    return problem, {kind.__name__: index}
+
+
+def bias_spline(spline, order=4, count=8, seed=5):
+    low, high = spline.domain
+    points = 0.1 * normal(count, 3, seed=seed)
+    if spline.dt_ns is not None:
+        dt = -(-(high - low) // (count - order + 1))
+        return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=low)
+    return BSpline(points, group=R3, order=order, dt=(high - low) / (count - order + 1), t0=low)

@@ -1,5 +1,6 @@
 """One residual inside a problem: its measurements in order of time, and its part of the normal equations."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -134,7 +135,7 @@ class Term:
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
             np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
-            np.ascontiguousarray(np.concatenate([c.reshape(len(first), -1) for c in columns], axis=1)),
+            np.ascontiguousarray(np.concatenate([c.reshape(len(first), math.prod(c.shape[1:])) for c in columns], axis=1)),
             rates,
         )  # fmt: skip
         if not self.clock:
