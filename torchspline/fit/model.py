@@ -149,10 +149,13 @@ class Model:
         return State(points, values, local, self.trajectory.local.pair_jacobians(local))
 
     def store(self, state: State) -> None:
-        """Write the numbers back."""
+        """Write the numbers of what may move back; the rest keeps its own, quaternions of any length included."""
         for spline in self.splines:
+            key = id(spline.module)
+            index = torch.from_numpy(np.flatnonzero(self.columns[key][:, 0] >= 0))
             with torch.no_grad():
                 target = spline.module.control_points
-                target.copy_(torch.from_numpy(state.points[id(spline.module)]).to(target))
+                target[index] = torch.from_numpy(state.points[key]).to(target)[index]
         for variable in self.variables:
-            variable.value = state.values[id(variable)].clone()
+            if id(variable) in self.columns:
+                variable.value = state.values[id(variable)].clone()

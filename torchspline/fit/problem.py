@@ -91,15 +91,13 @@ class Problem:
                 f"t: {residual.name} has {t.dtype} times; expected those of the trajectory, "
                 f"{'int64 nanoseconds' if self.trajectory.dt_ns is not None else 'float64 seconds'}"
             )
+        for slot, x in residual.arguments.items():
+            if isinstance(x, BSpline) and (message := _outside(residual, t.reshape(-1), x.domain)):
+                raise ValueError(f"{slot}: {message} of its spline; expected one that covers them")
         if residual.clock.unknowns:
             return  # where they lie on the trajectory is unknown; those outside are left out while they are
-        slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
-        outside = (t < domain[0] - slack) | (t > domain[1] + slack)
-        if bool(outside.any()):
-            raise ValueError(
-                f"t: {int(outside.sum())} of {outside.numel()} times of {residual.name} lie outside the trajectory's "
-                f"domain {list(domain)}, the first is {t[outside][0].item()!r}; leave them out or extend the trajectory"
-            )
+        if message := _outside(residual, t, domain):
+            raise ValueError(f"t: {message} of the trajectory; leave them out or extend the trajectory")
 
     def freeze(self, unknown: Unknown, points: Tensor | None = None) -> None:
         """Keep an unknown as it is: a `Variable`, or control points of a spline.
@@ -107,10 +105,7 @@ class Problem:
         Args:
             points: which control points stay, (M,) bool; None for all.
         """
-        if not any(x is unknown for x in self._unknowns):
-            raise ValueError(
-                f"unknown: expected the trajectory or an unknown of a residual that was added, got {unknown!r}"
-            )
+        self._known("unknown", unknown)
         if isinstance(unknown, Variable):
             if points is not None:
                 raise ValueError("points: only splines have control points")
@@ -128,7 +123,14 @@ class Problem:
 
     def release(self, unknown: Unknown) -> None:
         """Undo `freeze`."""
+        self._known("unknown", unknown)
         self._frozen.pop(id(unknown), None)
+
+    def _known(self, name: str, unknown: Unknown) -> None:
+        if not any(x is unknown for x in self._unknowns):
+            raise ValueError(
+                f"{name}: expected the trajectory or an unknown of a residual that was added, got {unknown!r}"
+            )
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -179,6 +181,9 @@ class Problem:
     def prepare(self) -> "Linearizer":
         """The problem in arrays."""
         origin = self.trajectory.domain[0]
+        for x in self._unknowns:
+            if isinstance(x, BSpline):
+                _check_spline("trajectory" if x is self.trajectory else "spline", x)
         splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, self._frozen)
@@ -228,6 +233,20 @@ def _check_spline(name: str, spline: BSpline) -> None:
         )
     if points.device.type != "cpu":
         raise ValueError(f"{name}: expected one on the CPU, got {points.device}; move it with .to('cpu')")
+    checks.finite(name, points)
+    checks.quaternions(name, points, spline.group.arithmetic.sign_blocks)
+
+
+def _outside(residual: Residual, t: Tensor, domain: tuple[float, float]) -> str:
+    """What is wrong with the times of a residual; nothing if they lie in the domain, up to rounding."""
+    slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
+    outside = (t < domain[0] - slack) | (t > domain[1] + slack)
+    if not bool(outside.any()):
+        return ""
+    return (
+        f"{int(outside.sum())} of {outside.numel()} times of {residual.name}, the first {t[outside][0].item()!r}, "
+        f"lie outside the domain {list(domain)}"
+    )
 
 
 def _index(residual: Residual, slot: str, x: Any) -> Array:
