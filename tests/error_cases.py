@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from types import SimpleNamespace
 
+import error_fit
 import torch
 from error_arguments import (
     ACCEPTED,
@@ -67,6 +68,8 @@ def cases() -> Iterator[Case]:
 
     quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0}
     for function, (_, good) in ACCEPTED.items():
+        if function in error_fit.FITTING:
+            continue
         if not function.startswith("Group.") and good.keys() & {
             "t",
             "control_points",
@@ -203,6 +206,7 @@ def cases() -> Iterator[Case]:
     yield from numbers(function, "t0")
     yield from fits()
     yield from files()
+    yield from error_fit.cases()
 
 
 def fits() -> Iterator[Case]:

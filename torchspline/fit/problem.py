@@ -57,7 +57,8 @@ class Problem:
         for slot, x in residual.arguments.items():
             if isinstance(x, Variable) and x.value.ndim == 2 and slot not in indices:
                 raise ValueError(
-                    f"{slot}: {x.name} holds several; say which each measurement sees: {slot}=index"
+                    f"{slot}: {x.name} holds {len(x.value)}; expected {slot}=index, which of them each measurement "
+                    "sees, got none"
                 )
         self._check_times(residual)
         unknowns = [
@@ -76,12 +77,8 @@ class Problem:
             return
         if isinstance(unknown, BSpline):
             _check_spline("spline", unknown)
-            if (unknown.dt_ns is None) != (self.trajectory.dt_ns is None):
-                raise TypeError(
-                    "spline: expected the trajectory's kind of time, seconds or nanoseconds, for both"
-                )
         elif any(isinstance(x, Variable) and x.name == unknown.name for x in self._unknowns):
-            raise ValueError(f"variable: a name stands for one unknown, got two called {unknown.name!r}")
+            raise ValueError(f"variable: expected one unknown of each name, got two called {unknown.name!r}")
         self._unknowns.append(unknown)
 
     def _check_times(self, residual: Residual) -> None:
@@ -92,6 +89,10 @@ class Problem:
                 f"{'int64 nanoseconds' if self.trajectory.dt_ns is not None else 'float64 seconds'}"
             )
         for slot, x in residual.arguments.items():
+            if isinstance(x, BSpline) and (x.dt_ns is None) != (self.trajectory.dt_ns is None):
+                raise TypeError(
+                    f"{slot}: expected a spline with the trajectory's kind of time, got seconds and nanoseconds"
+                )
             if isinstance(x, BSpline) and (message := _outside(residual, t.reshape(-1), x.domain)):
                 raise ValueError(f"{slot}: {message} of its spline; expected one that covers them")
         if residual.clock.unknowns:
@@ -108,17 +109,17 @@ class Problem:
         self._known("unknown", unknown)
         if isinstance(unknown, Variable):
             if points is not None:
-                raise ValueError("points: only splines have control points")
+                raise ValueError(f"points: only splines have control points, got {unknown!r}; expected None")
             self._frozen[id(unknown)] = True
             return
         count = unknown.control_points.shape[-2]
         if points is None:
             points = torch.ones(count, dtype=torch.bool)
         checks.instance("points", points, Tensor, "a bool tensor")
-        if points.shape != (count,) or points.dtype != torch.bool:
-            raise ValueError(
-                f"points: expected bool of shape ({count},), got {points.dtype} {tuple(points.shape)}"
-            )
+        if points.dtype != torch.bool:
+            raise TypeError(f"points: expected dtype torch.bool, got {points.dtype}")
+        if points.shape != (count,):
+            raise ValueError(f"points: expected shape ({count},), got {tuple(points.shape)}")
         self._frozen[id(unknown)] = points.cpu().numpy()
 
     def release(self, unknown: Unknown) -> None:
@@ -252,9 +253,14 @@ def _outside(residual: Residual, t: Tensor, domain: tuple[float, float]) -> str:
 def _index(residual: Residual, slot: str, x: Any) -> Array:
     variable = residual.arguments.get(slot)
     if not isinstance(variable, Variable) or variable.value.ndim != 2:
-        raise ValueError(f"{slot}: only an argument that is a Variable of several takes an index")
-    if not isinstance(x, Tensor) or x.dtype != torch.int64 or x.shape != (len(residual),):
-        raise ValueError(f"{slot}: expected an int64 index of shape ({len(residual)},)")
+        raise ValueError(
+            f"{slot}: an index is expected only with a Variable of several, shape (L, n), got {variable!r}"
+        )
+    checks.instance(slot, x, Tensor, "an int64 index, a torch.Tensor")
+    if x.dtype != torch.int64:
+        raise TypeError(f"{slot}: expected an index of dtype torch.int64, got {x.dtype}")
+    if x.shape != (len(residual),):
+        raise ValueError(f"{slot}: expected an index of shape ({len(residual)},), got {tuple(x.shape)}")
     index = x.cpu().numpy()
     count = variable.value.shape[0]
     if index.size and (index.min() < 0 or index.max() >= count):

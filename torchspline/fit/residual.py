@@ -150,18 +150,20 @@ class Residual(ABC):
         self.weighting: tuple[str, Tensor | None] = ("sigma", None)
         if self.rows is not None and self.measured_size is not None:
             self._check_sizes(self.rows, self.measured_size, self.measured_signs)
-        unknown = set(arguments) - set(self.slots)
-        if unknown:
-            raise TypeError(
-                f"{type(self).__name__}: unexpected argument {sorted(unknown)[0]!r}; it takes "
-                f"{', '.join(self.slots) or 'none besides the measurement'}"
-            )
+        for slot in arguments:
+            if slot not in self.slots:
+                raise TypeError(
+                    f"{slot}: {type(self).__name__} takes no such argument; it takes "
+                    f"{', '.join(self.slots) or 'none besides the measurement'}"
+                )
         self.arguments = {
             slot: _argument(slot, x, self.slots[slot], len(measured)) for slot, x in arguments.items()
         }
         for slot, (_, _, default) in self.slots.items():
             if slot not in arguments and default is None:
-                raise TypeError(f"{type(self).__name__}: argument {slot!r} is missing")
+                raise TypeError(
+                    f"{slot}: {type(self).__name__} needs a Variable, a spline or its value, got none"
+                )
 
     def _check_sizes(self, rows: int, measured_size: int, signs: Sequence[tuple[int, int]]) -> None:
         count = self.measured.shape[0]

@@ -132,10 +132,11 @@ class Term:
             rows = self.index[slot][first] if slot in self.index else np.zeros(len(first), np.int64)
             columns.append(own[rows])
         columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
+        blocks = [c.reshape(len(first), math.prod(c.shape[1:])) for c in columns]
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
             np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
-            np.ascontiguousarray(np.concatenate([c.reshape(len(first), math.prod(c.shape[1:])) for c in columns], axis=1)),
+            np.ascontiguousarray(np.concatenate(blocks, axis=1)),
             rates,
         )  # fmt: skip
         if not self.clock:

@@ -27,17 +27,17 @@ class _Reprojection(Residual):
 
     @staticmethod
     @abstractmethod
-    def visible(point: Vector) -> tuple[Vector, Scalar]:
+    def _visible(point: Vector) -> tuple[Vector, Scalar]:
         """The point, another one in its place where it cannot be seen, and 1, or 0 where it cannot."""
 
     @staticmethod
     @abstractmethod
-    def distort(point: Vector, k: Vector) -> Vector:
+    def _distort(point: Vector, k: Vector) -> Vector:
         """From a point (x, y, z) in the frame of the camera to the image plane at focal length one."""
 
     @staticmethod
     @abstractmethod
-    def distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
+    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
         """Cotangents of the point and of the coefficients."""
 
     def evaluate(
@@ -45,8 +45,8 @@ class _Reprojection(Residual):
     ) -> Vector:
         motion, camera = MOTIONS[group.name].motion(at[0].value, ()), given["intrinsics"]
         seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self.visible(seen)
-        x, y = self.distort(point, camera[4:])
+        point, shown = self._visible(seen)
+        x, y = self._distort(point, camera[4:])
         pixel = (times(camera[0], x), times(camera[1], y))
         return scale(shown, add(pixel, camera[2:4], negate(measured)))
 
@@ -61,11 +61,11 @@ class _Reprojection(Residual):
         mechanics, camera = MOTIONS[group.name], given["intrinsics"]
         motion = mechanics.motion(at[0].value, ())
         seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self.visible(seen)
-        x, y = self.distort(point, camera[4:])
+        point, shown = self._visible(seen)
+        x, y = self._distort(point, camera[4:])
         gu, gv = scale(shown, g)
         plane_g = (times(camera[0], gu), times(camera[1], gv))
-        point_g, k_g = self.distort_reverse(point, camera[4:], plane_g)
+        point_g, k_g = self._distort_reverse(point, camera[4:], plane_g)
         motion_g, T_g, landmark_g = sighted_reverse(
             motion, given["T_body_camera"], given["landmark"], point_g
         )
@@ -93,13 +93,13 @@ class ReprojectionRadtan(_Reprojection):
     """
 
     @staticmethod
-    def visible(point: Vector) -> tuple[Vector, Scalar]:
+    def _visible(point: Vector) -> tuple[Vector, Scalar]:
         x, y, z = point
         behind = (z < 1e-12) | (z * z < _ASIDE * dot((x, y), (x, y)))
         return (x, y, where(behind, 1.0, z)), where(behind, z - z, 1.0)
 
     @staticmethod
-    def distort(point: Vector, k: Vector) -> Vector:
+    def _distort(point: Vector, k: Vector) -> Vector:
         a, b, k1, k2, p1, p2 = point[0] / point[2], point[1] / point[2], *k
         r2, ab = a * a + b * b, 2.0 * (a * b)
         c = 1.0 + r2 * (k1 + r2 * k2)
@@ -109,7 +109,7 @@ class ReprojectionRadtan(_Reprojection):
         )
 
     @staticmethod
-    def distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
+    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
         nearness = 1.0 / point[2]
         a, b, k1, k2, p1, p2 = point[0] * nearness, point[1] * nearness, *k
         r2, ab = a * a + b * b, 2.0 * (a * b)
@@ -142,7 +142,7 @@ class ReprojectionEquidistant(_Reprojection):
     """
 
     @staticmethod
-    def visible(point: Vector) -> tuple[Vector, Scalar]:
+    def _visible(point: Vector) -> tuple[Vector, Scalar]:
         z = point[2]
         squared = dot(point, point)
         behind = (squared < 1e-24) | ((z < 0.0) & (_BEHIND * squared < z * z))
@@ -164,14 +164,14 @@ class ReprojectionEquidistant(_Reprojection):
         return ratio, r2 * (ratio * ratio), distance2
 
     @staticmethod
-    def distort(point: Vector, k: Vector) -> Vector:
+    def _distort(point: Vector, k: Vector) -> Vector:
         ratio, angle2, _ = ReprojectionEquidistant._angle(point)
         k1, k2, k3, k4 = k
         stretch = 1.0 + angle2 * (k1 + angle2 * (k2 + angle2 * (k3 + angle2 * k4)))
         return scale(ratio * stretch, point[:2])
 
     @staticmethod
-    def distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
+    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
         x, y, z = point
         ratio, angle2, distance2 = ReprojectionEquidistant._angle(point)
         k1, k2, k3, k4 = k
