@@ -173,6 +173,38 @@ def test_whole_nanoseconds(group):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7)
 
 
+def test_measurements_at_the_ends_of_the_domain_in_seconds_since_an_epoch():
+    for i in range(20):
+        spline = trajectory(R3, dt=0.03 + 0.001 * i, t0=1.6e9 + 0.1 * i + 0.037)
+        low, high = spline.domain
+        for count in (2, 7):
+            problem, t = Problem(spline), torch.linspace(low, high, count, dtype=torch.float64)
+            problem.add(Position(t, normal(len(t), 3, seed=1)))
+            with torch.no_grad():
+                expected = 0.5 * (spline(t) - problem.residuals[0].measured).square().sum()
+            assert of_system(problem.prepare())[2] == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_a_residual_that_is_refused_leaves_no_trace():
+    spline = trajectory(SE3)
+    problem, t = Problem(spline), spread(spline, 9)
+    problem.add(Gyroscope(t, normal(9, 3, seed=1), bias=Variable("bias", torch.zeros(3))))
+    new = {"gravity": Variable("gravity", torch.ones(3)), "bias": Variable("bias", torch.ones(3))}
+    with pytest.raises(ValueError, match="two called 'bias'"):
+        problem.add(Accelerometer(t, normal(9, 3, seed=1), **new))
+    assert list(problem.variables) == ["bias"]
+    assert len(problem.residuals) == 1
+
+
+def test_the_order_of_arguments_does_not_matter():
+    t = torch.zeros(1, dtype=torch.float64)
+    given = {"bias": torch.zeros(3), "scaling": torch.ones(9)}
+    first, second = (
+        Gyroscope(t, torch.zeros(1, 3), **dict(x)) for x in (given.items(), reversed(given.items()))
+    )
+    assert list(first.arguments) == list(second.arguments)
+
+
 def test_landmarks_and_cameras():
     spline = trajectory(SE3, gap=0.2)
     t = spread(spline, 30)

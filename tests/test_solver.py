@@ -25,14 +25,19 @@ from torchspline.fit import (
 )
 from torchspline.fit.solver import Options, minimise
 from torchspline.fit.system import Factor, SingularError, System
+from torchspline.kernels.mode import RefusedError
 
 # ---------------------------------------------------------------------- on functions of one number
 
 
 class Line:
-    """A model of one number."""
+    """A model of one number; kernels refuse numbers beyond the `limit`."""
+
+    limit = math.inf
 
     def moved(self, state, step):
+        if abs(state + step) > self.limit:
+            raise RefusedError
         return state + step
 
 
@@ -65,10 +70,11 @@ class Scalar(System):
         return self._square * x
 
 
-def minimise_scalar(r, d, start, **options):
-    seen = []
+def minimise_scalar(r, d, start, limit=math.inf, **options):
+    seen, line = [], Line()
+    line.limit = limit
     state, system, trace = minimise(
-        Line(),
+        line,
         np.array([start]),
         lambda x: Scalar(r(float(x[0])), d(float(x[0]))),
         Options(**options),
@@ -116,6 +122,13 @@ def test_values_that_are_not_finite_are_no_improvement():
         lambda x: math.log(x) if x > 0 else math.nan, lambda x: 1 / x, 9.0, damping=1e-9
     )
     assert x == pytest.approx(1.0, abs=1e-6)
+    assert trace.evaluations > len(trace.cost)
+
+
+def test_steps_that_kernels_refuse_are_no_improvement():
+    x, trace = minimise_scalar(math.atan, lambda x: 1 / (1 + x * x), 3.0, limit=3.5, damping=1e-9)
+    assert abs(x) < 1e-6
+    assert trace.converged
     assert trace.evaluations > len(trace.cost)
 
 

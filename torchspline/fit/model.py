@@ -36,6 +36,9 @@ class Spline:
         self.segments = self.count - self.order + 1
         self.size = self.group.tangent_size
         self.local = LocalSpline(self.name, self.order, self.spacing, self.count)
+        #: How far outside times may lie, in segments: seconds since an epoch are rounded, the origin included.
+        rounding = 0.0 if isinstance(origin, int) else abs(origin) / self.spacing
+        self.slack = 1e-9 + 8 * np.finfo(np.float64).eps * (rounding + self.segments)
         self._blending = np.array(blending_matrix(self.order), dtype=np.float64)
 
     def place(self, tau: Array) -> tuple[Array, Array, Array]:
@@ -43,8 +46,7 @@ class Spline:
         s = (tau - self.start) / self.spacing
         base = np.clip(np.floor(s), 0, self.segments - 1)
         u = s - base
-        slack = 1e-9 + 8 * np.finfo(np.float64).eps * self.segments
-        outside = (u < -slack) | (u > 1.0 + slack)
+        outside = (u < -self.slack) | (u > 1.0 + self.slack)
         return base.astype(np.int64), np.clip(u, 0.0, 1.0), outside
 
     def blending(self, u: Array) -> Array:

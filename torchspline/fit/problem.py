@@ -66,20 +66,24 @@ class Problem:
             for x in (*residual.arguments.values(), *residual.clock.unknowns)
             if isinstance(x, (Variable, BSpline))
         ]
-        for x in unknowns:
-            self._register(x)
+        self._unknowns += self._new(unknowns)
         self.residuals.append(residual)
         self._indices.append(indices)
         return residual
 
-    def _register(self, unknown: Unknown) -> None:
-        if any(x is unknown for x in self._unknowns):
-            return
-        if isinstance(unknown, BSpline):
-            _check_spline("spline", unknown)
-        elif any(isinstance(x, Variable) and x.name == unknown.name for x in self._unknowns):
-            raise ValueError(f"variable: expected one unknown of each name, got two called {unknown.name!r}")
-        self._unknowns.append(unknown)
+    def _new(self, unknowns: list[Unknown]) -> list[Unknown]:
+        """Those not known yet, each once; nothing is added before all were looked at."""
+        new: list[Unknown] = []
+        for x in unknowns:
+            known = [*self._unknowns, *new]
+            if any(y is x for y in known):
+                continue
+            if isinstance(x, BSpline):
+                _check_spline("spline", x)
+            elif any(isinstance(y, Variable) and y.name == x.name for y in known):
+                raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
+            new.append(x)
+        return new
 
     def _check_times(self, residual: Residual) -> None:
         t, domain = residual.t.detach(), self.trajectory.domain
@@ -240,7 +244,8 @@ def _check_spline(name: str, spline: BSpline) -> None:
 
 def _outside(residual: Residual, t: Tensor, domain: tuple[float, float]) -> str:
     """What is wrong with the times of a residual; nothing if they lie in the domain, up to rounding."""
-    slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
+    rounding = 8 * torch.finfo(torch.float64).eps * max(map(abs, domain))
+    slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0]) + rounding
     outside = (t < domain[0] - slack) | (t > domain[1] + slack)
     if not bool(outside.any()):
         return ""

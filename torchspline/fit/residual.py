@@ -156,8 +156,11 @@ class Residual(ABC):
                     f"{slot}: {type(self).__name__} takes no such argument; it takes "
                     f"{', '.join(self.slots) or 'none besides the measurement'}"
                 )
+        # In the order of the slots, however they were given: one kernel for each set of them.
         self.arguments = {
-            slot: _argument(slot, x, self.slots[slot], len(measured)) for slot, x in arguments.items()
+            slot: _argument(slot, arguments[slot], kind, len(measured))
+            for slot, kind in self.slots.items()
+            if slot in arguments
         }
         for slot, (_, _, default) in self.slots.items():
             if slot not in arguments and default is None:
