@@ -14,12 +14,14 @@ from error_arguments import (
     POSE,
     Case,
     Q,
+    T,
     V,
     changed,
     groups,
     numbers,
     refused,
     tensor,
+    times,
     wholes,
 )  # fmt: skip
 from fit_cases import sample
@@ -78,6 +80,20 @@ def with_point(method: str) -> Callable[..., Any]:
     return call
 
 
+def of_result(method: str) -> Callable[..., Any]:
+    """A method of the solution of a problem with a bias."""
+
+    def call(**k: Any) -> Any:
+        spline = BSpline(POSE[0], group=SE3, dt=0.1)
+        problem = fit.Problem(spline)
+        times = torch.linspace(0.0, 0.5, 40, dtype=F64)
+        problem.add(fit.Pose(times, spline(times).detach()))
+        problem.add(fit.Gyroscope(TIMES, V[0], bias=BIAS))
+        return getattr(problem.solve(max_iterations=1), method)(**k)
+
+    return call
+
+
 def solve(**k: Any) -> Any:
     problem = fit.Problem(BSpline(POSE[0], group=SE3, dt=0.1))
     problem.add(fit.Pose(TIMES, POSE[1]))
@@ -95,6 +111,10 @@ FITTING: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "smoothness": (fit.smoothness, {"trajectory": SPLINE, "derivative": 2, "sigma": 0.1, "nodes": None}),
     "Problem": (fit.Problem, {"trajectory": SPLINE}),
     "Problem.add": (add, {"residual": point(), "landmark": INDEX}),
+    "Problem.add_prior": (with_point("add_prior"), {"variable": BIAS, "sigma": 0.1}),
+    "Result.covariance": (of_result("covariance"), {"variable": BIAS}),
+    "Result.standard_deviation": (of_result("standard_deviation"), {"variable": BIAS}),
+    "Result.trajectory_covariance": (of_result("trajectory_covariance"), {"t": T, "derivatives": 0}),
     "Problem.freeze": (with_point("freeze"), {"unknown": SPLINE, "points": torch.ones(8, dtype=torch.bool)}),
     "Problem.release": (with_point("release"), {"unknown": SPLINE}),
     "Problem.solve": (solve, {"max_iterations": 1}),
@@ -134,25 +154,7 @@ def residual(function: str) -> Iterator[Case]:
     yield from tensor(function, "measured", "", slice(*signs[0]) if signs else None)
     yield case("measured", "count", measured[:-1], f"got {tuple(measured[:-1].shape)}", "N = 8 times")
 
-    for bad in ("1", True, 1j, [0.1]):
-        yield case("sigma", "type", bad, f"got {type(bad).__name__}", "expected a number")
-    for number in (0.0, -1.0, NAN, INF):
-        yield case("sigma", "nan", number, f"got {number}", "above zero")
-    yield case("sigma", "nan", torch.tensor(NAN), "got nan", "finite")
-    yield case("sigma", "option", torch.zeros(rows), "expected standard deviations above zero", "leave")
-    yield case("sigma", "dtype", torch.ones(rows, dtype=I64), "got torch.int64", "torch.float64")
-    yield case("sigma", "shape", torch.ones(8), "got (8,)", f"({rows},), (8, 1) or (8, {rows})")
-    one = torch.eye(rows, dtype=F64)
-    for name in ("covariance", "information"):
-        yield case(name, "type", 0.1, "got float", "a torch.Tensor")
-        yield case(name, "dtype", one.to(I64), "got torch.int64", "torch.float64")
-        yield case(name, "shape", one[0], f"got ({rows},)", f"({rows}, {rows}) or (8, {rows}, {rows})")
-        yield case(name, "nan", changed(one, (0, 0), NAN), "got nan at index (0, 0)", "finite")
-        yield case(name, "option", changed(one, (0, 1), 0.5), "expected symmetric", "matrices")
-        bad = changed(one.repeat(8, 1, 1), (2, 1, 1), -1.0)
-        yield case(name, "option", bad, "the one at index 2 is not", "positive definite")
-        both = "sigma, covariance, information"
-        yield refused(function, name, "option", one, "got several", "expected one of them", both, sigma=1.0)
+    yield from weights(function, rows, 8)
     yield case("loss", "type", "huber", "got str", "expected a robust loss")
     yield case("clock", "type", NUMBER, "got Variable", "expected a torchspline.fit.Clock")
     late = fit.Clock(delay=NUMBER, late=torch.zeros(7))
@@ -180,6 +182,72 @@ def residual(function: str) -> Iterator[Case]:
             yield case(slot, "zero quaternion", zero, "got length 0 at index ()", "expected quaternions")
             free = fit.Variable("v", torch.ones(size))
             yield case(slot, "option", free, f"'v', R{size}", f"expected a Variable of {group}")
+
+
+def weights(function: str, rows: int, count: int) -> Iterator[Case]:
+    """What standard deviations, covariances and information are tried with."""
+
+    def case(argument: str, category: str, bad: Any, came: str, expected: str) -> Case:
+        cleared = {"sigma": None, argument: bad}
+        return Case(function, argument, category, cleared, came, expected, argument)
+
+    for bad in ("1", True, 1j, [0.1]):
+        yield case("sigma", "type", bad, f"got {type(bad).__name__}", "expected a number")
+    for number in (0.0, -1.0, NAN, INF):
+        yield case("sigma", "nan", number, f"got {number}", "above zero")
+    yield case("sigma", "nan", torch.tensor(NAN), "got nan", "finite")
+    yield case("sigma", "option", torch.zeros(rows), "expected standard deviations above zero", "leave")
+    yield case("sigma", "dtype", torch.ones(rows, dtype=I64), "got torch.int64", "torch.float64")
+    yield case("sigma", "shape", torch.ones(8), "got (8,)", f"({rows},), ({count}, 1) or ({count}, {rows})")
+    one = torch.eye(rows, dtype=F64)
+    for name in ("covariance", "information"):
+        yield case(name, "type", 0.1, "got float", "a torch.Tensor")
+        yield case(name, "dtype", one.to(I64), "got torch.int64", "torch.float64")
+        yield case(name, "shape", one[0], f"got ({rows},)", f"({rows}, {rows}) or ({count}, {rows}, {rows})")
+        yield case(name, "nan", changed(one, (0, 0), NAN), "got nan at index (0, 0)", "finite")
+        yield case(name, "option", changed(one, (0, 1), 0.5), "expected symmetric", "matrices")
+        yield case(
+            name, "option", changed(one, (1, 1), -1.0), "the one at index 0 is not", "positive definite"
+        )
+        if count > 1:
+            bad = changed(one.repeat(count, 1, 1), (2, 1, 1), -1.0)
+            yield case(name, "option", bad, "the one at index 2 is not", "positive definite")
+        both = "sigma, covariance, information"
+        yield refused(function, name, "option", one, "got several", "expected one of them", both, sigma=1.0)
+
+
+def priors() -> Iterator[Case]:
+    function = "Problem.add_prior"
+    for bad in (None, "bias", SPLINE, BIAS.value):
+        yield refused(
+            function, "variable", "type", bad, f"got {type(bad).__name__}", "torchspline.fit.Variable"
+        )
+    twin = fit.Variable("bias", torch.zeros(3))
+    yield refused(function, "variable", "option", twin, "two called 'bias'", "one unknown of each name")
+    yield from weights(function, 3, 1)
+    every = "sigma, covariance, information"
+    yield refused(function, "sigma", "option", None, "got none", "expected one of them", every)
+    few = fit.Variable("few", torch.ones(3, 3))
+    each = torch.ones(3, 3)
+    yield refused(function, "sigma", "shape", each, "got shape (3, 3)", "one for all", variable=few)
+    many = torch.eye(3).repeat(3, 1, 1)
+    for name in ("covariance", "information"):
+        wrong = {"variable": few, "sigma": None, name: many}
+        yield Case(function, name, "shape", wrong, "got shape (3, 3, 3)", "one for all", name)
+
+
+def covariances() -> Iterator[Case]:
+    for function in ("Result.covariance", "Result.standard_deviation"):
+        for bad in (None, "bias", SPLINE):
+            yield refused(function, "variable", "type", bad, f"got {type(bad).__name__}", "fit.Variable")
+        yield refused(
+            function, "variable", "option", MAP, "map is not among", "unknowns that were solved for"
+        )
+    function = "Result.trajectory_covariance"
+    yield from (case for case in times(function) if case.category != "batch")
+    yield refused(function, "t", "shape", T[None], "got (1, 3)", "expected shape (N,)")
+    for bad in (4, -1, True, 1.0, None):
+        yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
 
 
 def variables() -> Iterator[Case]:
@@ -290,6 +358,8 @@ def problems() -> Iterator[Case]:
     states = fit.StateVelocity(TIMES, V[0])
     yield case("shape", {"residual": states}, "got (8, 3)", "expected shape (8, 6)", "measured")
 
+    yield from priors()
+    yield from covariances()
     for name in ("Problem.freeze", "Problem.release"):
         for bad in (None, "bias", fit.Variable("bias", torch.zeros(3)), TURNING):
             yield refused(name, "unknown", "option", bad, "got ", "an unknown of a residual that was added")

@@ -123,7 +123,7 @@ _QUATERNION = (
 )
 _POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
 _NEW = "Group.identity Group.random"
-_AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_AT_TIMES = "BSpline.evaluate BSpline.jacobians Trajectory.forward Trajectory.kinematics Mounted.evaluate"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
 _RESIDUALS = " ".join(RESIDUALS)
@@ -135,17 +135,19 @@ _WITHOUT_QUATERNIONS = " ".join(
     and all(slot.group is None for slot in kind.slots.values())
 )
 _LOSSES = " ".join(loss.__name__ for loss in Loss.__subclasses__())
-_SOLVING = "Problem.freeze Problem.release Problem.solve"
+_COVARIANCES = "Result.covariance Result.standard_deviation"
+_SOLVING = f"Problem.add_prior Problem.freeze Problem.release Problem.solve {_COVARIANCES}"
 
 #: Where a kind of mistake cannot be made: category -> reason -> functions.
 NOT_APPLICABLE = {
     "shape": {
-        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_LOSSES} Problem.release Problem.solve",
+        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_LOSSES} Problem.release Problem.solve {_COVARIANCES}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
     },
     "dtype": {
-        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_LOSSES} Problem Problem.release Problem.solve",
+        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_LOSSES} Problem Problem.release Problem.solve "
+        f"{_COVARIANCES}",
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
@@ -158,7 +160,7 @@ NOT_APPLICABLE = {
         "no numbers": f"{_MAKERS} {_NEW} {_WINDOWS} from_scipy",
         "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
         "checked when the residual was made": "Problem.add",
-        "no numbers that can be one": "Problem.freeze Problem.release",
+        "no numbers that can be one": f"Problem.freeze Problem.release {_COVARIANCES}",
     },
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
@@ -166,13 +168,14 @@ NOT_APPLICABLE = {
         "control points and mount were checked when the trajectory was made": _AT_TIMES,
         "rows stay as they are until they are used": "PoseRecord",
         "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
-        "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING}",
+        "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
+        "Result.trajectory_covariance",
     },
     "count": {
         "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
         "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
-        f"Problem.add {_SOLVING}",
+        f"Problem.add Result.trajectory_covariance {_SOLVING}",
     },
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "

@@ -1,5 +1,7 @@
 """Band, sparse and dense matrices of the same problem, and the compiled loops that fill them."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -58,9 +60,7 @@ def systems(problem):
     made = [BandSystem(model, linearizer.fused, model.band), SparseSystem(model, linearizer.fused)]
     for system in made:
         for term in linearizer.terms:
-            for cost, rows, _ in term.linearize(state):
-                system.cost += cost
-                system.add(rows, state.chain)
+            term.add_to(system, state)
     return made
 
 
@@ -134,7 +134,7 @@ def loop_arguments(seed=0, splines=2, order=4, size=6, others=5):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("splines", [0, 1, 2])
-def test_the_compiled_loops_of_assembly_are_the_python_ones(splines):
+def test_the_loops_of_assembly_agree_whatever_they_run_on(splines):
     rows, starts, bases, chain, order, size, columns, n, total = loop_arguments(seed=splines, splines=splines)
     common = (rows, starts, bases, chain, order, size, columns.astype(np.int64))
     # Rows in control points, one by one.
@@ -154,10 +154,16 @@ def test_the_compiled_loops_of_assembly_are_the_python_ones(splines):
         expected += J.T @ J
         right += J.T @ lines[:, -1]
     scale = np.abs(expected).max()
-    for fused in (False, True):
+    reference, compiled = (partial(assemble.add_to_band, x) for x in (False, True))
+    blocks_of = (
+        partial(assemble.add_to_blocks, False),
+        assemble.to_blocks,
+        partial(assemble.add_to_blocks, True),
+    )
+    for to_band, to_blocks in zip((reference, assemble.to_band, compiled), blocks_of, strict=True):
         band, border = np.zeros((n, n)), np.zeros((n, total - n))
         corner, got = np.zeros((total - n, total - n)), np.zeros(total)
-        assert assemble.add_to_band(fused, *common, band, border, corner, got) == 0
+        assert to_band(*common, band, border, corner, got) == 0
         dense = np.zeros((total, total))
         for d in range(n):
             dense[np.arange(d, n), np.arange(n - d)] = band[: n - d, d]
@@ -165,12 +171,9 @@ def test_the_compiled_loops_of_assembly_are_the_python_ones(splines):
         dense = np.tril(dense) + np.tril(dense, -1).T
         np.testing.assert_allclose(dense, expected, atol=1e-12 * scale)
         np.testing.assert_allclose(got, right, atol=1e-12 * np.abs(right).max())
-        assert (
-            assemble.add_to_band(fused, *common, band[:, :size].copy(), border, corner, got) > 0
-            or splines == 0
-        )
+        assert to_band(*common, band[:, :size].copy(), border, corner, got) > 0 or splines == 0
         blocks, got = np.empty((len(starts) - 1, columns.shape[1], columns.shape[1])), np.zeros(total)
-        assemble.add_to_blocks(fused, *common, blocks, got)
+        to_blocks(*common, blocks, got)
         dense = np.zeros((total + 1, total + 1))
         for block, line in zip(blocks, columns, strict=True):
             np.add.at(dense, np.ix_(line, line), block)

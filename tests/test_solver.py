@@ -48,6 +48,9 @@ class Inverse(Factor):
     def solve(self, right):
         return right / self.number
 
+    def inverse(self, i, j):
+        return np.full(i.shape, 1 / self.number)
+
 
 class Scalar(System):
     """r(x) with derivative d(x)."""
