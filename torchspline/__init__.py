@@ -1,6 +1,6 @@
 """torchspline: continuous-time motion as a PyTorch layer."""
 
-from torchspline import functional, imu
+from torchspline import fit, functional, imu
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
 from torchspline.kernels.mode import use_kernels
@@ -31,6 +31,7 @@ __all__ = [
     "Trajectory",
     "consistent_signs",
     "convert",
+    "fit",
     "fit_poses",
     "functional",
     "imu",

@@ -1,5 +1,60 @@
 """Trajectories and sensor parameters from measurements."""
 
+from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
 from torchspline.fit.poses import PoseFit, fit_poses
+from torchspline.fit.problem import Problem
+from torchspline.fit.residual import Clock, Residual
+from torchspline.fit.residuals import (
+    Accelerometer,
+    AngularAcceleration,
+    BodyVelocity,
+    Direction,
+    Gyroscope,
+    Orientation,
+    Point,
+    Pose,
+    Position,
+    RelativePose,
+    ReprojectionEquidistant,
+    ReprojectionRadtan,
+    StateAcceleration,
+    StateJerk,
+    StateValue,
+    StateVelocity,
+    WorldVelocity,
+)
+from torchspline.fit.result import Result
+from torchspline.fit.smoothness import smoothness
+from torchspline.fit.variables import Variable
 
-__all__ = ["PoseFit", "fit_poses"]
+__all__ = [
+    "Accelerometer",
+    "AngularAcceleration",
+    "BodyVelocity",
+    "Cauchy",
+    "Clock",
+    "Direction",
+    "GemanMcClure",
+    "Gyroscope",
+    "Huber",
+    "Loss",
+    "Orientation",
+    "Point",
+    "Pose",
+    "PoseFit",
+    "Position",
+    "Problem",
+    "RelativePose",
+    "ReprojectionEquidistant",
+    "ReprojectionRadtan",
+    "Residual",
+    "Result",
+    "StateAcceleration",
+    "StateJerk",
+    "StateValue",
+    "StateVelocity",
+    "Variable",
+    "WorldVelocity",
+    "fit_poses",
+    "smoothness",
+]

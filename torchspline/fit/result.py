@@ -156,6 +156,8 @@ class Result:
             ValueError: a time outside the domain; the measurements do not determine all unknowns.
         """
         model = self._linearizer.model
+        if isinstance(t, Tensor) and t.ndim > 1:
+            raise ValueError(f"t: expected shape (N,) or (), got {tuple(t.shape)}")
         spline, trajectory = model.trajectory, model.trajectory.module
         jacobians = trajectory.jacobians(t, derivatives, side="right")
         stacked = torch.cat([x for x in jacobians[1 : 2 + derivatives] if x is not None], dim=-2).double()

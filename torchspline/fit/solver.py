@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchspline.fit.model import Model, State
 from torchspline.fit.system import Factor, SingularError, System
+from torchspline.kernels.mode import RefusedError
 
 Array = NDArray[Any]
 #: Damping is a share of the diagonal, which is taken to be at least this share of its largest element.
@@ -86,13 +87,16 @@ def minimise(
         clock = trace.spend("solve", clock)
         gain, candidate, fresh = -1.0, state, system
         if step is not None:
-            candidate = model.moved(state, step)
-            clock = trace.spend("update", clock)
-            fresh = linearize(candidate)
+            expected = 0.5 * float(step @ (damping * scale * step - system.right))
+            try:
+                candidate = model.moved(state, step)
+                clock = trace.spend("update", clock)
+                fresh = linearize(candidate)
+                gain = _gain(system, fresh, expected)
+            except RefusedError:  # so far away that control points are no numbers any more
+                gain = -1.0
             clock = trace.spend("linearize", clock)
             trace.evaluations += 1
-            expected = 0.5 * float(step @ (damping * scale * step - system.right))
-            gain = _gain(system, fresh, expected)
             if gain <= 0 and expected <= max(options.cost, _ROUNDING) * system.cost:
                 trace.reason, trace.converged = "no step lowers the cost any more", True
                 return state, system, trace

@@ -1,5 +1,6 @@
 """One residual inside a problem: its measurements in order of time, and its part of the normal equations."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import NANOSECOND, Model, State
+from torchspline.fit.model import NANOSECOND, Model, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
@@ -48,19 +49,21 @@ class Term:
         if np.array_equal(self.order, np.arange(len(self.order))):
             self.order = np.arange(len(self.order))
         self.tau = np.ascontiguousarray(tau[:, self.order])
-        mid = torch.as_tensor(residual.clock.mid, dtype=residual.t.dtype)
-        self.mid = float(seconds_of(mid, origin)) if residual.clock.skew is not None else 0.0
+        mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing
+        self.mid = 0.5 * length if mid is None else seconds(mid, origin)
         self.measured = residual.measured.detach().cpu().to(torch.float64).numpy()[self.order]
         self.index = {slot: x[self.order] for slot, x in index.items()}
         self.weights = self._weights()
+        #: Known arguments of which each measurement has its own.
+        self.each = {
+            slot for slot, x in residual.arguments.items() if isinstance(x, torch.Tensor) and x.ndim == 2
+        }
         given = tuple(
-            (slot, isinstance(x, BSpline) or slot in index) for slot, x in residual.arguments.items()
+            (slot, isinstance(x, BSpline) or slot in index or slot in self.each)
+            for slot, x in residual.arguments.items()
         )
         self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
-        self.clock = [
-            v for v in (residual.clock.offset, residual.clock.skew, residual.clock.delay)
-            if v is not None and id(v) in model.columns
-        ]  # fmt: skip
+        self.clock = [v for v in residual.clock.unknowns if id(v) in model.columns]
         self.splines = {
             slot: next(s for s in model.splines if s.module is x)
             for slot, x in residual.arguments.items()
@@ -118,10 +121,11 @@ class Term:
             rows = self.index[slot][first] if slot in self.index else np.zeros(len(first), np.int64)
             columns.append(own[rows])
         columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
+        blocks = [c.reshape(len(first), math.prod(c.shape[1:])) for c in columns]
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
             np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
-            np.ascontiguousarray(np.concatenate([c.reshape(len(first), -1) for c in columns], axis=1)),
+            np.ascontiguousarray(np.concatenate(blocks, axis=1)),
             rates,
         )  # fmt: skip
         if not self.clock:
@@ -248,6 +252,8 @@ class Term:
             if isinstance(x, Variable)
             else x.detach().cpu().to(torch.float64).numpy()
         )
+        if slot in self.each:
+            return value[self.order[part]]
         return value[self.index[slot][part]] if slot in self.index else value.reshape(-1)
 
     def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, float]:
