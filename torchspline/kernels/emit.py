@@ -152,9 +152,19 @@ def emit_pairs(
     return _source(name, ["stored", "points", "unit", "logs", "begin", "stop"], program, dtype, parts, _EXACT)
 
 
-def _locate(nanoseconds: bool) -> list[str]:
-    """Segment and place within it of query `block + i`, as in `splines/clock.py`, and the row of its trajectory."""
-    if nanoseconds:
+def _locate(nanoseconds: bool | None) -> list[str]:
+    """Segment and place within it of query `block + i`, as in `splines/clock.py`, and the row of its trajectory.
+
+    Args:
+        nanoseconds: whether times are; None: they are pairs of a place and a segment.
+    """
+    if nanoseconds is None:
+        place = [
+            "at = 2 * (column if shared else block + i)",
+            "u = times[at]",
+            "segment = min(max(int(times[at + 1]), 0), segments - 1)",
+        ]
+    elif nanoseconds:
         place = [
             "elapsed = times[column if shared else block + i] - t0",
             "segment = min(max(elapsed // dt, 0), segments - 1)",
@@ -192,7 +202,7 @@ class SplineLayout(NamedTuple):
     steps: int
     derivatives: int
     dtype: torch.dtype
-    nanoseconds: bool
+    nanoseconds: bool | None
 
 
 def emit_forward(name: str, program: Trace, layout: SplineLayout) -> str:

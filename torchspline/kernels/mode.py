@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 from torch.nn import Parameter
 
 from torchspline import checks
+from torchspline.kernels import triton
 from torchspline.kernels.build import available
 
 Mode = Literal["auto", "fused", "reference"]
@@ -44,24 +45,38 @@ def current() -> str:
 
 
 def usable(*tensors: object) -> bool:
-    """Whether a kernel may serve a call with these tensors (numbers are welcome): eager, on the CPU, untransformed."""
+    """Whether a loop may serve a call with these tensors (numbers are welcome): eager, on the CPU, untransformed.
+
+    On a GPU there are none, but see `splines/fused.py`.
+    """
     mode = current()
     if mode == "reference":
         return False
     seen = tuple(x for x in tensors if isinstance(x, Tensor))
-    plain = (
-        all(x.device.type == "cpu" and type(x) in (Tensor, Parameter) for x in seen)
-        and not (torch.is_grad_enabled() and any(x.is_inference() for x in seen))
+    eager = plain(*seen)
+    devices = {x.device for x in seen}
+    here = eager and all(device.type == "cpu" for device in devices) and available()
+    if mode == "fused" and not here and not (eager and all(map(triton_available, devices))):
+        raise RuntimeError(
+            f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors outside torch.func transforms "
+            "and forward-mode differentiation, and Numba on the CPU or Triton on a GPU"
+        )
+    return here
+
+
+def plain(*tensors: Tensor) -> bool:
+    """Whether these are numbers in memory, and nothing needs to see what is done to them."""
+    return (
+        all(type(x) in (Tensor, Parameter) for x in tensors)
+        and not (torch.is_grad_enabled() and any(x.is_inference() for x in tensors))
         and not torch.compiler.is_compiling()
         and not transformed()
-        and available()
     )
-    if mode == "fused" and not plain:
-        raise RuntimeError(
-            f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors on the CPU outside "
-            "torch.func transforms and forward-mode differentiation, and Numba"
-        )
-    return plain
+
+
+def triton_available(device: torch.device) -> bool:
+    """Whether kernels can be had for a GPU."""
+    return device.type == "cuda" and triton.available(device)
 
 
 def transformed() -> bool:

@@ -50,15 +50,35 @@ class Clock:
         if first < last:
             return everything
         offset = first * self.queries if self.shared else 0
-        times = self.times[begin - offset : stop - offset]
-        # Whole nanoseconds as Python's numbers: in float64 an epoch is off by more than a short spacing.
-        elapsed = [t.item() - self.t0 for t in (times.min(), times.max())]
-        low, high = (x / self.dt for x in elapsed)
-        if not np.isfinite(low + high) or (times.dtype == np.int64 and max(map(abs, elapsed)) >= 2**63):
+        low, high = self.extent(begin - offset, stop - offset)
+        if not np.isfinite(low + high):
             return everything
         start = min(max(int(low) - 1, 0), self.segments - 1)
         end = min(max(int(high) + 2, 1), self.segments) + order - 1
         return first * self.points + start, first * self.points + min(end, self.points)
+
+    def extent(self, begin: int, stop: int) -> tuple[float, float]:
+        """Where the times `begin` to `stop` lie, in knot spacings from the start; NaN where the loops overflow."""
+        times = self.times[begin:stop]
+        # Whole nanoseconds as Python's numbers: in float64 an epoch is off by more than a short spacing.
+        low, high = (t.item() - self.t0 for t in (times.min(), times.max()))
+        if times.dtype == np.int64 and max(abs(low), abs(high)) >= 2**63:
+            return np.nan, np.nan
+        return low / self.dt, high / self.dt
+
+
+@dataclass(frozen=True)
+class Places(Clock):
+    """Pairs in float64 of a place in a segment, u, and the segment, instead of times; with t0 = 0 and dt = 1 all
+    derivatives are by u."""
+
+    @property
+    def queries(self) -> int:
+        return super().queries // 2
+
+    def extent(self, begin: int, stop: int) -> tuple[float, float]:
+        segments = self.times[2 * begin + 1 : 2 * stop : 2]
+        return segments.min(), segments.max()
 
 
 @dataclass(frozen=True)
@@ -78,8 +98,9 @@ class SplineKernels:
         rows: Sequence[Sequence[Fraction]],
         derivatives: int,
         dtype: torch.dtype,
-        nanoseconds: bool,
+        nanoseconds: bool | None,
     ):
+        """`nanoseconds`: whether times are; None: for `Places`."""
         self.group, self.rows, self.derivatives = arithmetic(group), rows, derivatives
         self.dtype, self.nanoseconds = dtype, nanoseconds
         self.real = np.float32 if dtype == torch.float32 else np.float64
