@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from operator import attrgetter
 from typing import Any, Literal
 
 import torch
@@ -19,6 +20,10 @@ Mode = Literal["auto", "fused", "reference"]
 MODES: tuple[str, ...] = ("auto", "fused", "reference")
 #: Environment variable with the mode of a process.
 VARIABLE = "TORCHSPLINE_KERNELS"
+
+# Subclasses want to see what is done to them.
+_PLAIN = {Tensor, Parameter}
+_is_cpu = attrgetter("is_cpu")
 
 _mode: ContextVar[str | None] = ContextVar("torchspline_kernels", default=None)
 
@@ -52,11 +57,10 @@ def usable(*tensors: object) -> bool:
     mode = current()
     if mode == "reference":
         return False
-    seen = tuple(x for x in tensors if isinstance(x, Tensor))
+    seen = [x for x in tensors if isinstance(x, Tensor)]
     eager = plain(*seen)
-    devices = {x.device for x in seen}
-    here = eager and all(device.type == "cpu" for device in devices) and available()
-    if mode == "fused" and not here and not (eager and all(map(triton_available, devices))):
+    here = eager and all(map(_is_cpu, seen)) and available()
+    if mode == "fused" and not here and not (eager and all(triton_available(x.device) for x in seen)):
         raise RuntimeError(
             f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors outside torch.func transforms "
             "and forward-mode differentiation, and Numba on the CPU or Triton on a GPU"
@@ -67,8 +71,8 @@ def usable(*tensors: object) -> bool:
 def plain(*tensors: Tensor) -> bool:
     """Whether these are numbers in memory, and nothing needs to see what is done to them."""
     return (
-        all(type(x) in (Tensor, Parameter) for x in tensors)
-        and not (torch.is_grad_enabled() and any(x.is_inference() for x in tensors))
+        _PLAIN.issuperset(map(type, tensors))
+        and not (torch.is_grad_enabled() and any(map(Tensor.is_inference, tensors)))
         and not torch.compiler.is_compiling()
         and not transformed()
     )

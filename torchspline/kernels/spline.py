@@ -6,7 +6,7 @@ Symbols: B trajectories of M control points with P numbers and D dimensions, N t
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from torchspline.kernels.threads import SERIAL_BELOW, run, spans
 REVERSE_CHUNK = 16384
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # not frozen: that makes them five times as slow to make
 class Clock:
     """Times of all queries, flat, and the knots they refer to; seconds in float64 or whole nanoseconds."""
 
@@ -67,7 +67,7 @@ class Clock:
         return low / self.dt, high / self.dt
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Places(Clock):
     """Pairs in float64 of a place in a segment, u, and the segment, instead of times; with t0 = 0 and dt = 1 all
     derivatives are by u."""
@@ -81,7 +81,7 @@ class Places(Clock):
         return segments.min(), segments.max()
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Pairs:
     """What control points alone determine: unit points of continuous sign and logarithms of neighbours, flat."""
 
@@ -118,16 +118,23 @@ class SplineKernels:
         bad = self._pairs(stored, points, unit, logs, 0, total)
         return Pairs(unit, logs), bad
 
+    def results(self, shape: tuple[int, ...]) -> list[Array]:
+        """Room for what `forward` fills, `(*shape, P or D)`."""
+        return [np.empty((*shape, size), self.real) for size in self.result_sizes]
+
     def forward(self, pairs: Pairs, clock: Clock, outputs: Sequence[Array]) -> int:
         """Fill value and rates (per second); how many times lie outside the domain."""
         total = clock.trajectories * clock.queries
         arguments = (*clock.arguments(), self._scale(clock), *outputs)
-        function, outside = self._forward, []
+        function = self._forward
+        if 0 < total < 2 * SERIAL_BELOW:  # also without what follows, which counts when there are few
+            return function(pairs.unit, pairs.logs, *arguments, 0, total)
+        outside = []
 
         def part(begin: int, stop: int) -> None:
             outside.append(function(pairs.unit, pairs.logs, *arguments, begin, stop))
 
-        parts = torch.get_num_threads() if total >= 2 * SERIAL_BELOW else 1
+        parts = torch.get_num_threads()
         run([partial(part, begin, stop) for begin, stop in spans(total, parts, emit.BLOCK)])
         return sum(outside)
 
@@ -186,8 +193,7 @@ class SplineKernels:
         return gradient
 
     def _scale(self, clock: Clock) -> Array:
-        seconds = clock.dt * 1e-9 if self.nanoseconds else clock.dt
-        return np.array([seconds ** -(r + 1) for r in range(self.derivatives)], dtype=self.real)
+        return _scale(clock.dt * 1e-9 if self.nanoseconds else clock.dt, self.derivatives, self.real)
 
     # ------------------------------------------------------------------ compilation
 
@@ -259,6 +265,12 @@ class SplineKernels:
             self.dtype,
             self.nanoseconds,
         )
+
+
+@lru_cache(256)
+def _scale(seconds: float, derivatives: int, real: type) -> Array:
+    """1/dt, 1/dt^2, ...: only read."""
+    return np.array([seconds ** -(r + 1) for r in range(derivatives)], dtype=real)
 
 
 def _chunk_count(total: int, points: int) -> int:

@@ -168,7 +168,7 @@ def _seconds(name: str, x: Any, t: Tensor, check: Callable[[str, float], float])
             )
         if (number := checks.seen_number(x)) is not None:
             check(name, number)
-        return x.to(torch.float64)
+        return x if x.dtype == torch.float64 else x.to(torch.float64)
     if isinstance(x, bool) or not isinstance(x, (int, float)):
         raise TypeError(f"{name}: expected seconds as a number or a 0-dim tensor, got {type(x).__name__}")
     return check(name, float(x))

@@ -38,7 +38,7 @@ def small(group: str, order: int) -> bool:
     return order * arithmetic(group).tangent_size <= _SMALL
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Call:
     """What does not change hands as a tensor: sizes, knots as numbers, and the same computation by the reference."""
 
@@ -83,7 +83,7 @@ def fused_bspline(
     start, spacing = _number(t0), _number(dt)
     slack = float(tolerance(t, start, spacing, segments)) if validate else None
     call = Call(kernels, segments, start, spacing, slack, reference)
-    times = t if t.dtype == torch.int64 else t.to(torch.float64)
+    times = t.to(torch.float64) if t.dtype == torch.float32 else t
     try:
         return FusedBSpline.apply(control_points, times, _learnt(t0), _learnt(dt), call)
     except RefusedError:
@@ -127,12 +127,11 @@ class FusedBSpline(Function):
         pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
         if bad and call.tolerance is not None:
             raise RefusedError
-        sizes = call.kernels.result_sizes
-        outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
-        outside = call.kernels.forward(pairs, clock, [flat(x) for x in outputs])
-        if outside:
+        results = call.kernels.results((*batch, t.shape[-1]))
+        if call.kernels.forward(pairs, clock, [x.reshape(-1) for x in results]):
             raise RefusedError
-        ctx.call, ctx.pairs = call, pairs
+        outputs = tuple(map(torch.from_numpy, results))
+        ctx.call, ctx.clock, ctx.pairs = call, clock, pairs
         ctx.save_for_backward(control_points, t, t0, dt)
         # Not saved for backward: there, writing to a result in place would be an error, which it is not elsewhere.
         ctx.results = tuple(x.detach() for x in (outputs[:1] if dt is None else outputs))
@@ -152,9 +151,9 @@ class FusedBSpline(Function):
             control_points.new_zeros(*shape, size) if c is None else c
             for c, size in zip(cotangents, sizes, strict=True)
         ]
-        clock = call.clock(control_points, t)
         value, value_g, *rates_g = map(flat, (results[0], *filled))
-        stored_g, u_g = call.kernels.reverse(flat(control_points), ctx.pairs, clock, value, value_g, rates_g)
+        stored = flat(control_points)
+        stored_g, u_g = call.kernels.reverse(stored, ctx.pairs, ctx.clock, value, value_g, rates_g)
         t_g = None
         if any(ctx.needs_input_grad[1:4]):
             t_g = torch.from_numpy(u_g).reshape(shape).to(torch.float64) / call.dt
@@ -231,10 +230,9 @@ class _OnCPU:
 
     def _forward(self, control_points: Tensor, places: Places) -> tuple[Any, list[Tensor]]:
         pairs, _ = self.kernels.pairs(flat(control_points), places.trajectories, places.points)
-        shape = (*control_points.shape[:-2], places.queries)
-        results = [control_points.new_empty(*shape, size) for size in self.kernels.result_sizes]
-        self.kernels.forward(pairs, places, [flat(x) for x in results])
-        return pairs, results
+        results = self.kernels.results((*control_points.shape[:-2], places.queries))
+        self.kernels.forward(pairs, places, [x.reshape(-1) for x in results])
+        return pairs, list(map(torch.from_numpy, results))
 
     def _places(self, control_points: Tensor, u: Tensor, index: Tensor) -> Places:
         pairs = torch.stack([u.detach().to(torch.float64), index.to(torch.float64)], dim=-1)
