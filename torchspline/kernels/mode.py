@@ -34,7 +34,7 @@ def use_kernels(mode: Mode) -> Iterator[None]:
 
     Holds for the thread that entered the block; others follow the environment variable.
     The results are the same up to rounding. "fused" raises `RuntimeError` where a kernel exists but cannot run; calls
-    that have none (extrapolation, group operations on few rows, linear maps) use the reference in every mode.
+    that have none (group operations on few rows or on a GPU, linear maps) use the reference in every mode.
     """
     checks.choice("mode", mode, MODES)
     token = _mode.set(mode)
