@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from numbers import Real
+from operator import attrgetter
 from typing import Any, Protocol
 
 import torch
@@ -21,6 +22,7 @@ class HasPoints(Protocol):
 
 #: Quaternions may have any length in this range; beyond it their squares leave the range of float32.
 SHORTEST_QUATERNION, LONGEST_QUATERNION = 1e-15, 1e15
+_is_cpu = attrgetter("is_cpu")
 
 
 def is_floating_tensor(name: str, x: object) -> Tensor:
@@ -67,9 +69,7 @@ def broadcast(**shapes: Sequence[int]) -> torch.Size:
 
 def values_visible(*tensors: Tensor) -> bool:
     """Whether looking at values is possible and free of a device round trip: eager code on the CPU."""
-    if torch.compiler.is_compiling():
-        return False
-    return all(x.device.type == "cpu" for x in tensors)
+    return not torch.compiler.is_compiling() and all(map(_is_cpu, tensors))
 
 
 def finite(name: str, x: Tensor) -> None:

@@ -97,7 +97,9 @@ def minimise(
                 gain = -1.0
             clock = trace.spend("linearize", clock)
             trace.evaluations += 1
-            if gain <= 0 and expected <= max(options.cost, _ROUNDING) * system.cost:
+            # A step that is short because of much damping proves nothing.
+            near = damping <= 1.0 and expected <= max(options.cost, _ROUNDING) * system.cost
+            if gain <= 0 and near:
                 trace.reason, trace.converged = "no step lowers the cost any more", True
                 return state, system, trace
         if gain > 0:

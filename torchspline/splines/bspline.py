@@ -11,14 +11,12 @@ from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import R3, SO3, Group, Side, product
 from torchspline.kernels.mode import usable
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, check_float32, locate
-from torchspline.splines.fused import fused_bspline, kernels_of
+from torchspline.splines.fused import fused_bspline, kernels_of, small
 from torchspline.splines.jacobians import Jacobians, bspline_jacobians
 from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
 
 _NANOSECOND = 1e-9
-#: Largest order times dimension for which a kernel is compiled: beyond, straight-line code takes minutes to compile.
-_SMALL = 64
 
 
 def bspline(
@@ -84,7 +82,7 @@ def bspline(
     fields = None
     # Asked first: Dynamo cannot trace the context variable that `usable` reads.
     eager = not torch.compiler.is_compiling()
-    if eager and order * group.tangent_size <= _SMALL and usable(control_points, times, start, spacing):
+    if eager and small(group.name, order) and usable(control_points, times, start, spacing):
         kernels = kernels_of(group.name, order, derivatives, control_points.dtype, times.dtype == torch.int64)
         if validate:
             check_float32(times, spacing)
@@ -175,7 +173,7 @@ def _seconds(name: str, x: Any, t: Tensor, check: Callable[[str, float], float])
             )
         if (number := checks.seen_number(x)) is not None:
             check(name, number)
-        return x.to(torch.float64)
+        return x if x.dtype == torch.float64 else x.to(torch.float64)
     if isinstance(x, bool) or not isinstance(x, (int, float)):
         raise TypeError(f"{name}: expected seconds as a number or a 0-dim tensor, got {type(x).__name__}")
     return check(name, float(x))
