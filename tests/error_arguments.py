@@ -33,6 +33,7 @@ def file(content: str, name: str) -> str:
 POSE = SE3.random(2, 8, generator=torch.Generator().manual_seed(0))
 TANGENT = torch.full((2, 8, 6), 0.1, dtype=F64)
 Q, V = POSE[..., 3:], POSE[..., :3]
+DUAL = convert.pose_to_dual_quaternion(POSE)
 T = torch.tensor([0.0, 0.2, 0.5], dtype=F64)
 STAMPS = torch.arange(8, dtype=F64)
 NS = torch.arange(3)
@@ -89,6 +90,11 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Group.adjoint_act": (SE3.adjoint_act, {"point": POSE, "tangent": TANGENT}),
     "Group.bracket": (SE3.bracket, {"a": TANGENT, "b": TANGENT}),
     "Group.retract": (SE3.retract, {"point": POSE, "tangent": TANGENT, "side": "left"}),
+    "Group.power": (SE3.power, {"point": POSE, "exponent": TANGENT[..., 0]}),
+    "pose_to_dual_quaternion": (convert.pose_to_dual_quaternion, {"pose": POSE}),
+    "pose_from_dual_quaternion": (convert.pose_from_dual_quaternion, {"Q": DUAL}),
+    "to_screw": (convert.to_screw, {"Q": DUAL}),
+    "from_screw": (convert.from_screw, convert.to_screw(DUAL)._asdict()),
     "Group.interpolate": (SE3.interpolate, {"start": POSE, "end": POSE, "s": TANGENT[..., 0]}),
     "to_xyzw": (convert.to_xyzw, {"q": Q}),
     "from_xyzw": (convert.from_xyzw, {"q": Q}),

@@ -65,7 +65,7 @@ def cases() -> Iterator[Case]:
             yield refused(function, "dtype", "dtype", bad, f"got {bad}", "torch.float32 or torch.float64")
     yield refused("Group.random", "generator", "type", 5, "got int", "expected a torch.Generator")
 
-    quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0}
+    quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0, "Q": 0}
     for function, (_, good) in ACCEPTED.items():
         if not function.startswith("Group.") and good.keys() & {
             "t",
@@ -77,13 +77,15 @@ def cases() -> Iterator[Case]:
             continue  # sequences and records come below
         together = [name for name, x in good.items() if isinstance(x, torch.Tensor)]
         for name in together:
-            if name in ("s", "matrix", "T_body_sensor"):
+            if name in ("s", "exponent", "matrix", "T_body_sensor") or function == "from_screw":
                 continue
             start = quaternions.get(name)
             width = good[name].shape[-1]
             part = None if start is None else slice(start, width)
             if function == "pose_from_xyzw":
                 part = slice(3, 7)
+            if name == "Q":
+                part = slice(0, 4)
             others = [other for other in together if other != name]
             yield from tensor(function, name, f" (..., {width})", part, others[0] if others else None)
             if others:
@@ -96,18 +98,22 @@ def cases() -> Iterator[Case]:
             yield refused(function, "matrix", "option", bad, "is off by", "expected matrices of the group")
     for bad in ("Left", None, 1):
         yield refused("Group.retract", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
-    s = TANGENT[..., 0]
-    for bad in (None, "a", [0.5], 1j, True):
-        yield refused("Group.interpolate", "s", "type", bad, f"got {type(bad).__name__}", "expected a number")
-    for bad in (s.to(I64), s.half()):
-        yield refused("Group.interpolate", "s", "dtype", bad, f"got {bad.dtype}", "torch.float64")
-    for bad in (NAN, s * INF):
-        yield refused(
-            "Group.interpolate", "s", "nan", bad, f"got {'inf' if bad is not NAN else 'nan'}", "finite"
-        )
-    yield refused("Group.interpolate", "s", "batch", s[..., :3], "s (2, 3)", "start (2, 8)")
-    yield refused("Group.interpolate", "s", "device", s.to("meta"), "meta", "cpu")
-    yield refused("Group.interpolate", "s", "mixed dtype", s.float(), "torch.float32", "torch.float64")
+    for function, name, start in (
+        ("Group.interpolate", "s", "start"),
+        ("Group.power", "exponent", "point"),
+    ):
+        s = TANGENT[..., 0]
+        for bad in (None, "a", [0.5], 1j, True):
+            yield refused(function, name, "type", bad, f"got {type(bad).__name__}", "expected a number")
+        for bad in (s.to(I64), s.half()):
+            yield refused(function, name, "dtype", bad, f"got {bad.dtype}", "torch.float64")
+        for bad in (NAN, s * INF):
+            came = f"got {'inf' if bad is not NAN else 'nan'}"
+            yield refused(function, name, "nan", bad, came, "finite")
+        yield refused(function, name, "batch", s[..., :3], f"{name} (2, 3)", f"{start} (2, 8)")
+        yield refused(function, name, "device", s.to("meta"), "meta", "cpu")
+        yield refused(function, name, "mixed dtype", s.float(), "torch.float32", "torch.float64")
+    yield from screws()
     for function in ("to_euler", "from_euler"):
         for bad in ("xxz", "XYz", "xy", "", None, 5):
             yield refused(function, "sequence", "option", bad, f"got {bad!r}", "one of 'XYX'")
@@ -203,6 +209,20 @@ def cases() -> Iterator[Case]:
     yield from numbers(function, "t0")
     yield from fits()
     yield from files()
+
+
+def screws() -> Iterator[Case]:
+    function = "from_screw"
+    good = ACCEPTED[function][1]
+    for name, x in good.items():
+        if name in ("axis", "moment"):
+            yield from tensor(function, name, " (..., 3)", None, "angle" if name == "axis" else "axis")
+        else:
+            for case in tensor(function, name, "", None, "axis"):
+                if case.category != "shape":
+                    yield case
+        yield refused(function, name, "batch", x[:1, :3], f"{name} (1, 3)", "(2, 8)")
+    yield refused(function, "axis", "option", 2 * good["axis"], "got length 2", "length one")
 
 
 def fits() -> Iterator[Case]:

@@ -95,16 +95,15 @@ _GROUP_TANGENT = (
     "Group.right_jacobian Group.right_jacobian_inverse"
 )
 _GROUP_POINT = "Group.adjoint Group.inverse Group.log Group.normalize Group.to_matrix"
-_GROUP_TWO = (
-    "Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.interpolate Group.bracket"
-)
+_GROUP_TWO = "Group.power from_screw Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.interpolate Group.bracket"
 _MATRIX = "Group.from_matrix from_rotation_matrix from_transform_matrix from_transform3d"
 _VECTOR = "from_rotation_vector from_euler"
+_DUAL = "pose_to_dual_quaternion pose_from_dual_quaternion to_screw"
 _QUATERNION = (
     "to_xyzw from_xyzw pose_to_xyzw pose_from_xyzw to_rotation_matrix to_rotation_vector to_transform_matrix "
     "to_euler to_scipy to_pypose from_pypose to_transform3d"
 )
-_POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
+_POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} {_DUAL} from_scipy"
 _NEW = "Group.identity Group.random"
 _AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
 _FILES = "read_poses read_imu write_poses write_imu"
@@ -130,7 +129,7 @@ NOT_APPLICABLE = {
         "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
     },
     "zero quaternion": {
-        "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
+        "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket from_screw "
         "from_scipy read_imu write_imu ImuRecord",
         "control points and mount were checked when the trajectory was made": _AT_TIMES,
         "rows stay as they are until they are used": "PoseRecord",

@@ -2,7 +2,7 @@
 
 from torchspline import functional, imu
 from torchspline.fit import PoseFit, fit_poses
-from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
+from torchspline.groups import R3, SE2, SE3, SO2, SO3, DualQuaternion, Group, Rn, convert, product
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines import (
     BSpline,
@@ -19,9 +19,12 @@ __version__ = "0.1.0"
 
 __all__ = [
     "R3",
+    "SE2",
     "SE3",
+    "SO2",
     "SO3",
     "BSpline",
+    "DualQuaternion",
     "Group",
     "Kinematics",
     "PoseFit",

@@ -66,11 +66,14 @@ def rotation_log(q: Vector) -> Vector:
     near zero and no square root whose derivative could be infinite.
     """
     far = on_far_side(q)
-    w, x, y, z = (where(far, -c, c) for c in q)
-    v = (x, y, z)
-    reciprocal = 1.0 / (1.0 + w)
-    factor = 4.0 * reciprocal * series.arctan_factor(dot(v, v) * (reciprocal * reciprocal))
-    return scale(factor, v)
+    near = tuple(where(far, -c, c) for c in q)
+    return scale(log_factor(near), near[1:])
+
+
+def log_factor(q: Vector) -> Scalar:
+    """theta / sin(theta/2), the ratio of rotation vector and vector part, of a unit quaternion on the near side."""
+    reciprocal = 1.0 / (1.0 + q[0])
+    return 4.0 * reciprocal * series.arctan_factor(dot(q[1:], q[1:]) * (reciprocal * reciprocal))
 
 
 def rotation_exp(x: Vector, short: bool) -> Vector:
@@ -89,7 +92,7 @@ class SO3(AdjointSeriesGroup):
     tangent_size = 3
     act_size = 3
     matrix_size = 3
-    sign_blocks = ((0, 4),)
+    sign_blocks = unit_blocks = ((0, 4),)
 
     def identity(self) -> tuple[float, ...]:
         return (1.0, 0.0, 0.0, 0.0)

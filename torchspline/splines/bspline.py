@@ -127,7 +127,7 @@ def _check_control_points(control_points: Tensor, group: Group, order: int) -> N
 
 def _check_values(control_points: Tensor, group: Group) -> None:
     checks.finite("control_points", control_points)
-    checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
+    checks.quaternions("control_points", control_points, group.arithmetic.unit_blocks)
 
 
 def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any]:

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torchspline import checks
-from torchspline.groups.group import SE3, SO3, Group
+from torchspline.groups.convert import pose_from_dual_quaternion, pose_to_dual_quaternion
+from torchspline.groups.group import SE3, SO3, DualQuaternion, Group
 
 
 class State(NamedTuple):
@@ -67,12 +68,17 @@ def _of_se3(s: State) -> Kinematics:
     return Kinematics(q, s.value[..., :3], velocity, acceleration, w, a[..., 3:])
 
 
+def _of_dual_quaternion(s: State) -> Kinematics:
+    return _of_se3(s._replace(value=pose_from_dual_quaternion(s.value)))
+
+
 #: How the states of a group read as motion; a group that moves a rigid body adds its line here and in `_ATTACH`.
 MECHANICS: dict[str, Callable[[State], Kinematics]] = {
     "SO3": _of_so3,
     "R3": _of_r3,
     "R3xSO3": _of_split,
     "SE3": _of_se3,
+    "DualQuaternion": _of_dual_quaternion,
 }
 
 
@@ -107,7 +113,7 @@ class Trajectory(nn.Module, ABC):
         """Rotation, position and their rates at the times `t`.
 
         Raises:
-            ValueError: the group is not one of SO3, R3, R3xSO3, SE3.
+            ValueError: the group is not one of SO3, R3, R3xSO3, SE3, DualQuaternion.
         """
         if self.group.name not in MECHANICS:
             raise ValueError(
@@ -168,11 +174,15 @@ class Mounted(Trajectory):
         return _ATTACH[self.group.name](state, T)
 
 
-def _attach_se3(s: State, T: Tensor) -> State:
+def _attach_se3(s: State, T: Tensor, group: Group = SE3) -> State:
     """T is constant, so every rate is just seen from the other frame: Ad_{T^-1}."""
-    back = SE3.inverse(T, validate=False)
-    rates = (None if r is None else SE3.adjoint_act(back, r, validate=False) for r in s[1:])
-    return State(SE3.compose(s.value, T, validate=False), *rates)
+    back = group.inverse(T, validate=False)
+    rates = (None if r is None else group.adjoint_act(back, r, validate=False) for r in s[1:])
+    return State(group.compose(s.value, T, validate=False), *rates)
+
+
+def _attach_dual_quaternion(s: State, T: Tensor) -> State:
+    return _attach_se3(s, pose_to_dual_quaternion(T), DualQuaternion)
 
 
 def _attach_so3(s: State, T: Tensor) -> State:
@@ -212,4 +222,5 @@ _ATTACH: dict[str, Callable[[State, Tensor], State]] = {
     "SO3": _attach_so3,
     "R3xSO3": _attach_split,
     "SE3": _attach_se3,
+    "DualQuaternion": _attach_dual_quaternion,
 }
