@@ -95,7 +95,10 @@ _GROUP_TANGENT = (
     "Group.right_jacobian Group.right_jacobian_inverse"
 )
 _GROUP_POINT = "Group.adjoint Group.inverse Group.log Group.normalize Group.to_matrix"
-_GROUP_TWO = "Group.power from_screw Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.interpolate Group.bracket"
+_WEIGHTED = "Group.power Group.interpolate from_screw"
+_GROUP_TWO = (
+    f"{_WEIGHTED} Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.bracket"
+)
 _MATRIX = "Group.from_matrix from_rotation_matrix from_transform_matrix from_transform3d"
 _VECTOR = "from_rotation_vector from_euler"
 _DUAL = "pose_to_dual_quaternion pose_from_dual_quaternion to_screw"
@@ -129,8 +132,8 @@ NOT_APPLICABLE = {
         "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
     },
     "zero quaternion": {
-        "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket from_screw "
-        "from_scipy read_imu write_imu ImuRecord",
+        "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
+        "from_screw from_scipy read_imu write_imu ImuRecord",
         "control points and mount were checked when the trajectory was made": _AT_TIMES,
         "rows stay as they are until they are used": "PoseRecord",
     },

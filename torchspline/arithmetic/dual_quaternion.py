@@ -3,7 +3,7 @@
 Q = q + e q' with the dual unit e, e e = 0. It is a unit if `|q| = 1` and `q . q' = 0`; then q is the rotation and
 `2 q' conj(q)` the translation, body to world. -Q is the same motion.
 
-Stored numbers are any Q with q different from zero: `normalize` divides by the dual number `|Q| = |q| + e (q . q')/|q|`,
+Stored numbers are any Q whose q is not zero: `normalize` divides by the dual number `|Q| = |q| + e (q . q')/|q|`,
 so neither a common length nor a part of q' along q matters, and gradients are orthogonal to both.
 """
 
