@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import torchspline
 import torchspline.io as records
-from torchspline import R3, SE3, SO3, BSpline, Rn, SplitBSpline, imu
+from torchspline import R3, SE3, SO3, BSpline, HermiteSpline, Rn, SplitBSpline, imu
 from torchspline.groups import convert
 from torchspline.splines.trajectory import Mounted
 
@@ -38,6 +38,14 @@ T = torch.tensor([0.0, 0.2, 0.5], dtype=F64)
 STAMPS = torch.arange(8, dtype=F64)
 NS = torch.arange(3)
 SPLINE = SplitBSpline(POSE, dt=0.1)
+KNOTS = {
+    "values": POSE,
+    "velocities": TANGENT,
+    "accelerations": TANGENT,
+    "group": SE3,
+    "times": torch.linspace(0.0, 0.5, 8, dtype=F64),
+}
+HERMITE = HermiteSpline(**KNOTS)
 SE3_MATRIX, SO3_MATRIX = SE3.to_matrix(POSE), SO3.to_matrix(Q)
 TUM_FILE = file("1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0 0 1\n", "good.txt")
 IMU_FILE = file("1520530308189679351,1,2,3,4,5,6\n", "good.csv")
@@ -127,6 +135,10 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"T_body_sensor": POSE[0, 0], "t": T, "derivatives": 2},
     ),
     "measure": (imu.measure, {"trajectory": SPLINE, "t": T}),
+    "hermite": (torchspline.functional.hermite, {**KNOTS, "t": T, "coordinates": "product", "frame": "body"}),
+    "HermiteSpline": (HermiteSpline, {**KNOTS, "coordinates": "logarithm", "frame": "world"}),
+    "HermiteSpline.evaluate": (HERMITE.evaluate, {"t": T, "derivatives": 2, "frame": "world"}),
+    "HermiteSpline.differentials": (HERMITE.differentials, {"t": T, "side": "left"}),
     "consistent_signs": (torchspline.consistent_signs, {"points": POSE, "group": SE3}),
     "phantom_points": (torchspline.phantom_points, {"keyframes": POSE, "group": SE3}),
     "initial_control_points": (
@@ -223,8 +235,12 @@ def tensor(
         yield case("mixed dtype", good.float(), "torch.float32", "torch.float64")
 
 
-def times(function: str, scalar: bool = True) -> Iterator[Case]:
-    """What the times of a trajectory with the domain [0, 0.5] are tried with."""
+def times(function: str, points: str = "control_points", ns: bool = True) -> Iterator[Case]:
+    """What the times of a trajectory with the domain [0, 0.5] are tried with.
+
+    Args:
+        points: what it is made of. ns: whether there are trajectories of its kind in nanoseconds.
+    """
 
     def case(category: str, bad: Any, came: str, expected: str) -> Case:
         return refused(function, "t", category, bad, came, expected)
@@ -233,14 +249,14 @@ def times(function: str, scalar: bool = True) -> Iterator[Case]:
     yield case("type", T.numpy(), "got ndarray", "expected a torch.Tensor")
     for dtype in (torch.float16, torch.bfloat16, torch.complex128, torch.int32, torch.bool):
         yield case("dtype", T.to(dtype), f"got {dtype}", "torch.float32 or torch.float64")
-    yield case("dtype", NS, "int64 times", "dt_ns")
+    yield case("dtype", NS, *(("int64 times", "dt_ns") if ns else ("got torch.int64", "torch.float64")))
     yield case("device", T.to("meta"), "meta", "cpu")
-    yield case("batch", T.expand(3, 3), "t (3,)", "control_points (2,)")
+    yield case("batch", T.expand(3, 3), "t (3,)", f"{points} (2,)")
     for value in (NAN, INF, -INF):
         yield case("nan", changed(T, 1, value), f"got {value} at index (1,)", "expected finite numbers")
     yield case("time", T + 0.1, "the first is 0.6", "outside the domain [0.0, 0.5] s")
     yield case("time", T[:1] - 1e-9, "the first is -1e-09", "outside the domain [0.0, 0.5] s")
-    yield case("time", T.float() + 1e6, "near 1e+06 s", "dt = 0.1 s")
+    yield case("time", T.float() + 1e6, "near 1e+06 s", "dt = 0.1 s" if ns else "shortest segment")
 
 
 def spacings(function: str, ns: dict[str, Any]) -> Iterator[Case]:

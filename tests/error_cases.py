@@ -69,6 +69,7 @@ def cases() -> Iterator[Case]:
     for function, (_, good) in ACCEPTED.items():
         if not function.startswith("Group.") and good.keys() & {
             "t",
+            "times",
             "control_points",
             "keyframes",
             "points",
@@ -190,6 +191,7 @@ def cases() -> Iterator[Case]:
         yield refused("measure", name, "shape", (0.0, 9.8), "got (2,)", "expected shape (..., 3)")
         yield refused("measure", name, "batch", V[0, :4], f"{name} (4, 3)", "readings (2, 3, 3)")
 
+    yield from hermite()
     yield from control_points("consistent_signs", "points", POSE, 1)
     yield from control_points("phantom_points", "keyframes", POSE, 2)
     yield refused("phantom_points", "keyframes", "count", POSE[:, :2], "got 2", "at least 3 points", order=6)
@@ -209,6 +211,46 @@ def cases() -> Iterator[Case]:
     yield from numbers(function, "t0")
     yield from fits()
     yield from files()
+
+
+def knot_times(function: str, argument: str, what: str) -> Iterator[Case]:
+    """What the times of knots or keys are tried with; eight are expected."""
+    good = ACCEPTED[function][1][argument]
+    for case in tensor(function, argument, " (8,), one time for each", mixed=None, like=good):
+        if case.category != "shape":
+            yield case
+    for bad in (good[:-1], good[None], good[0]):
+        yield refused(function, argument, "shape", bad, f"got {tuple(bad.shape)}", "expected shape (8,)")
+    yield refused(function, argument, "option", good.flip(0), "and then", "increasing times")
+    yield refused(function, argument, "option", 0 * good, "got 0.0 and then 0.0", "drop duplicates")
+    yield refused(function, argument, "device", good.to("meta"), "meta", "cpu")
+
+
+def hermite() -> Iterator[Case]:
+    for function in ("hermite", "HermiteSpline"):
+        yield from control_points(function, "values", POSE, 2)
+        for name in ("velocities", "accelerations"):
+            yield from tensor(function, name, " (2, 8, 6), tangents of", None, "values")
+            yield refused(
+                function, name, "shape", TANGENT[:, :7], "got (2, 7, 6)", "expected shape (2, 8, 6)"
+            )
+        yield from knot_times(function, "times", "knots")
+        yield from groups(function)
+        for name, options in (("coordinates", "'product', 'logarithm'"), ("frame", "'body', 'world'")):
+            for bad in ("Body", "", None, True):
+                yield refused(function, name, "option", bad, f"got {bad!r}", options)
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+    for function in ("hermite", "HermiteSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+    for function in ("hermite", "HermiteSpline.evaluate", "HermiteSpline.differentials"):
+        yield from times(function, "values", ns=False)
+    for bad in ("Body", None):
+        yield refused("HermiteSpline.evaluate", "frame", "option", bad, f"got {bad!r}", "'body', 'world'")
+        yield refused("HermiteSpline.differentials", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
 
 
 def screws() -> Iterator[Case]:

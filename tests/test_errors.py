@@ -68,7 +68,7 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit"}
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Differentials"}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
@@ -108,7 +108,8 @@ _QUATERNION = (
 )
 _POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} {_DUAL} from_scipy"
 _NEW = "Group.identity Group.random"
-_AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_HERMITE = "HermiteSpline.evaluate HermiteSpline.differentials"
+_AT_TIMES = f"{_HERMITE} BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
 
@@ -143,7 +144,7 @@ NOT_APPLICABLE = {
     },
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
-        "SplitBSpline Trajectory.mounted Mounted",
+        "SplitBSpline HermiteSpline Trajectory.mounted Mounted",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
         "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
     },

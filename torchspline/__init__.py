@@ -6,6 +6,8 @@ from torchspline.groups import R3, SE2, SE3, SO2, SO3, DualQuaternion, Group, Rn
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines import (
     BSpline,
+    Differentials,
+    HermiteSpline,
     Kinematics,
     SplitBSpline,
     State,
@@ -24,8 +26,10 @@ __all__ = [
     "SO2",
     "SO3",
     "BSpline",
+    "Differentials",
     "DualQuaternion",
     "Group",
+    "HermiteSpline",
     "Kinematics",
     "PoseFit",
     "Rn",

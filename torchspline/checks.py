@@ -102,8 +102,12 @@ def quaternions(name: str, x: Tensor, blocks: Sequence[tuple[int, int]]) -> None
         )
 
 
-def points(name: str, x: Tensor, group: "HasPoints", least: int) -> None:
-    """A sequence `(*batch, M, P)` of at least `least` points of `group`, finite, with usable quaternions."""
+def points(name: str, x: Tensor, group: "HasPoints", least: int, look: bool = True) -> None:
+    """A sequence `(*batch, M, P)` of at least `least` points of `group`, finite, with usable quaternions.
+
+    Args:
+        look: whether to look at values.
+    """
     is_floating_tensor(name, x)
     if x.ndim < 2 or x.shape[-1] != group.point_size:
         raise ValueError(
@@ -111,6 +115,8 @@ def points(name: str, x: Tensor, group: "HasPoints", least: int) -> None:
         )
     if x.shape[-2] < least:
         raise ValueError(f"{name}: expected at least {least} points of {group}, got {x.shape[-2]}")
+    if not look:
+        return
     finite(name, x)
     quaternions(name, x, group.arithmetic.unit_blocks)
 

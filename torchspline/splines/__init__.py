@@ -1,11 +1,14 @@
 """Spline families on Lie groups."""
 
 from torchspline.splines.bspline import BSpline, SplitBSpline
+from torchspline.splines.hermite import Differentials, HermiteSpline
 from torchspline.splines.keyframes import consistent_signs, initial_control_points, phantom_points
 from torchspline.splines.trajectory import Kinematics, State, Trajectory
 
 __all__ = [
     "BSpline",
+    "Differentials",
+    "HermiteSpline",
     "Kinematics",
     "SplitBSpline",
     "State",

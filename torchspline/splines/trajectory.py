@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,27 @@ class State(NamedTuple):
     velocity: Tensor | None = None
     acceleration: Tensor | None = None
     jerk: Tensor | None = None
+
+
+def to_world_frame(state: State, group: Group) -> State:
+    """The same derivatives in the world frame, `dX/dt X^-1` and its derivatives by time, as [E17] has them.
+
+    Ad_X carries velocity and acceleration across, and jerk once `[velocity, acceleration]` is added.
+    """
+    X, v, a, j = state
+    if j is not None and v is not None and a is not None:
+        j = j + group.bracket(v, a, validate=False)
+    return State(X, *(None if r is None else group.adjoint_act(X, r, validate=False) for r in (v, a, j)))
+
+
+def to_body_frame(state: State, group: Group) -> State:
+    """Inverse of `to_world_frame`."""
+    X, *rates = state
+    back = group.inverse(X, validate=False)
+    v, a, j = (None if r is None else group.adjoint_act(back, r, validate=False) for r in rates)
+    if j is not None and v is not None and a is not None:
+        j = j - group.bracket(v, a, validate=False)
+    return State(X, v, a, j)
 
 
 class Kinematics(NamedTuple):
@@ -87,6 +108,8 @@ class Trajectory(nn.Module, ABC):
 
     #: The group its values live in.
     group: Group
+    #: Names of what it keeps in seconds: tensors, Parameters or None, float64 whatever the module is converted to.
+    _times: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -104,6 +127,33 @@ class Trajectory(nn.Module, ABC):
             self.register_parameter(name, x)
         else:
             self.register_buffer(name, x)
+
+    def _adopt(self, name: str, x: Tensor, learnable: bool) -> None:
+        """Keep `x` as given if it carries a graph or is a `Parameter`, else a copy: a `Parameter` if `learnable`."""
+        if not x.requires_grad and not isinstance(x, nn.Parameter):
+            x = x.clone(memory_format=torch.contiguous_format)
+            if learnable:
+                x = nn.Parameter(x)
+        self._keep(name, x)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> "Trajectory":
+        """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
+        times: dict[str, Tensor] = {n: x for n in self._times if (x := getattr(self, n)) is not None}
+        # A Parameter is converted in place: only other tensors on the same memory still have its numbers then.
+        numbers = {name: x.detach() for name, x in times.items()}
+        learnt = {name: x for name, x in times.items() if isinstance(x, nn.Parameter)}
+        grads = {name: x.grad.detach() for name, x in learnt.items() if x.grad is not None}
+        super()._apply(fn, recurse)
+        for name, before in times.items():
+            new = getattr(self, name)
+            if new.dtype == numbers[name].dtype:
+                continue
+            if isinstance(new, nn.Parameter):
+                new.data = numbers[name].to(new.device)
+                new.grad = grads[name].to(new.device) if name in grads else None
+            else:
+                setattr(self, name, before.to(new.device))
+        return self
 
     def forward(self, t: Tensor) -> Tensor:
         """Values at the times `t`, `(*batch, N, P)`."""
