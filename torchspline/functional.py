@@ -2,5 +2,7 @@
 
 from torchspline.splines.bspline import bspline
 from torchspline.splines.hermite import hermite
+from torchspline.splines.interpolation import interpolate
+from torchspline.splines.nonuniform import nonuniform_bspline
 
-__all__ = ["bspline", "hermite"]
+__all__ = ["bspline", "hermite", "interpolate", "nonuniform_bspline"]

@@ -70,6 +70,15 @@ class GroupArithmetic(ABC):
     def log(self, X: Vector) -> Vector:
         """The shortest x with Exp(x) = X; at exactly pi its first non-zero rotation component is positive."""
 
+    def signed_log(self, X: Vector) -> Vector:
+        """The x with Exp(x) = X, signs of numbers included: beyond pi, up to 2 pi, where they lie on the far side.
+
+        On the double cover, as on SU(2) in [H18] (11)-(13). At minus the identity, where no axis is nearer
+        than another,
+        that of the identity; it jumps there.
+        """
+        return self.log(X)
+
     @abstractmethod
     def act(self, X: Vector, point: Vector) -> Vector:
         """X applied to a point of the space it acts on."""

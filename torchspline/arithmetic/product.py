@@ -69,6 +69,9 @@ class Product(GroupArithmetic):
     def log(self, X: Vector) -> Vector:
         return self._each("log", "P", X)
 
+    def signed_log(self, X: Vector) -> Vector:
+        return self._each("signed_log", "P", X)
+
     def act(self, X: Vector, point: Vector) -> Vector:
         return self._each("act", "PA", X, point)
 

@@ -4,8 +4,8 @@ from abc import abstractmethod
 
 from torchspline.arithmetic import series, so3
 from torchspline.arithmetic.group import AdjointSeriesGroup, Matrix
-from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, add, cross, dot, is_zero, zero
+from torchspline.arithmetic.scalar import Scalar, where
+from torchspline.arithmetic.vector import Vector, add, cross, dot, is_zero, scale, zero
 
 ROTATION = so3.SO3()
 
@@ -24,6 +24,15 @@ class RigidMotion(AdjointSeriesGroup):
     @abstractmethod
     def translation(self, X: Vector) -> Vector:
         """Position of the body in the world."""
+
+    def signed_log(self, X: Vector) -> Vector:
+        """A full turn back about the same screw: its pitch stays, its axis and moment have turned the other way."""
+        x, far = self.log(X), so3.on_far_side(self.rotation(X))
+        v, w = x[:3], x[3:]
+        back = so3.full_turn_back(w, far)
+        size2 = dot(w, w)
+        along = dot(v, w) / where(far & (size2 > 0), size2, 1.0)
+        return (*add(v, scale(back, add(v, scale(-along, w)))), *add(w, scale(back, w)))
 
     def act(self, X: Vector, point: Vector) -> Vector:
         return add(self.translation(X), so3.rotate(self.rotation(X), point))

@@ -86,6 +86,13 @@ def unit(q: Vector) -> Vector:
     return scale(1.0 / sqrt(dot(q, q)), q)
 
 
+def full_turn_back(x: Vector, far: Scalar) -> Scalar:
+    """-2 pi / |x| on the far side, else 0; 0 too at minus the identity, which turns about no axis."""
+    size2 = dot(x, x)
+    turning = far & (size2 > 0)
+    return where(turning, -6.283185307179586 / sqrt(where(turning, size2, 1.0)), 0.0)
+
+
 class SO3(AdjointSeriesGroup):
     name = "SO3"
     point_size = 4
@@ -114,6 +121,10 @@ class SO3(AdjointSeriesGroup):
 
     def log(self, X: Vector) -> Vector:
         return rotation_log(X)
+
+    def signed_log(self, X: Vector) -> Vector:
+        x, far = rotation_log(X), on_far_side(X)
+        return add(x, scale(full_turn_back(x, far), x))
 
     def act(self, X: Vector, point: Vector) -> Vector:
         return rotate(X, point)

@@ -75,17 +75,20 @@ def check_query(
 
 
 def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate: bool) -> Place:
-    """Segment between neighbouring `times` (M,) and place within it, computed before any rounding to float32.
+    """Segment between neighbouring `times` (M,), which do not decrease, and place within it, computed before any
+    rounding to float32.
 
     A knot belongs to the segment that it starts; the last one to the last segment. Where values cannot be seen (other
     devices, `vmap`, compilation) times outside give NaN instead of an error.
     """
-    knots, s = times.to(torch.float64), t.to(torch.float64)
+    knots, s = times.to(torch.float64).contiguous(), t.to(torch.float64)
     steps = knots.diff()
     if validate:
         _check_rounding(t, steps)
-    last = knots.shape[0] - 2
-    segment = (torch.searchsorted(knots.detach(), s.detach().contiguous(), right=True) - 1).clamp(0, last)
+    # The last segment of some duration: knots may come more than once.
+    last = (knots.detach() < knots.detach()[-1]).sum() - 1
+    segment = torch.searchsorted(knots.detach(), s.detach().contiguous(), right=True) - 1
+    segment = torch.minimum(segment.clamp_min(0), last)
     duration = steps[segment]
     u = (s - knots[segment]) / duration
     rounding = 8.0 * torch.finfo(torch.float32 if t.dtype == torch.float32 else torch.float64).eps
@@ -103,7 +106,7 @@ def _check_rounding(t: Tensor, steps: Tensor) -> None:
     if t.dtype != torch.float32 or t.numel() == 0 or not checks.values_visible(t):
         return
     rounding = torch.finfo(torch.float32).eps * t.detach().abs().amax()
-    shortest = steps.detach().amin()
+    shortest = torch.where(steps.detach() > 0, steps.detach(), torch.inf).amin()
     if checks.seen_true(rounding.to(torch.float64) > 1e-3 * shortest):
         raise ValueError(
             f"t: float32 rounds times near {t.detach().abs().amax().item():.6g} s to {rounding.item():.1e} s, more "
