@@ -13,7 +13,18 @@ from scipy.spatial.transform import Rotation
 
 import torchspline
 import torchspline.io as records
-from torchspline import R3, SE3, SO3, BSpline, HermiteSpline, Rn, SplitBSpline, imu
+from torchspline import (
+    R3,
+    SE3,
+    SO3,
+    BSpline,
+    HermiteSpline,
+    KeyframeSpline,
+    NonuniformBSpline,
+    Rn,
+    SplitBSpline,
+    imu,
+)
 from torchspline.groups import convert
 from torchspline.splines.trajectory import Mounted
 
@@ -46,6 +57,12 @@ KNOTS = {
     "times": torch.linspace(0.0, 0.5, 8, dtype=F64),
 }
 HERMITE = HermiteSpline(**KNOTS)
+KNOTTED = {
+    "control_points": POSE,
+    "group": SE3,
+    "knots": torch.tensor([0.0] * 4 + [0.1, 0.2, 0.3, 0.4] + [0.5] * 4, dtype=F64),
+}
+KEYED = {"keyframes": POSE, "times": KNOTS["times"]}
 SE3_MATRIX, SO3_MATRIX = SE3.to_matrix(POSE), SO3.to_matrix(Q)
 TUM_FILE = file("1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0 0 1\n", "good.txt")
 IMU_FILE = file("1520530308189679351,1,2,3,4,5,6\n", "good.csv")
@@ -139,6 +156,16 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "HermiteSpline": (HermiteSpline, {**KNOTS, "coordinates": "logarithm", "frame": "world"}),
     "HermiteSpline.evaluate": (HERMITE.evaluate, {"t": T, "derivatives": 2, "frame": "world"}),
     "HermiteSpline.differentials": (HERMITE.differentials, {"t": T, "side": "left"}),
+    "nonuniform_bspline": (torchspline.functional.nonuniform_bspline, {**KNOTTED, "t": T}),
+    "NonuniformBSpline": (NonuniformBSpline, KNOTTED),
+    "NonuniformBSpline.evaluate": (NonuniformBSpline(**KNOTTED).evaluate, {"t": T, "derivatives": 2}),
+    "NonuniformBSpline.insert_knot": (NonuniformBSpline(**KNOTTED).insert_knot, {"time": 0.25}),
+    "interpolate": (
+        torchspline.functional.interpolate,
+        {"method": "geodesic", **KEYED, "t": T, "group": SE3, "derivatives": 2},
+    ),
+    "KeyframeSpline": (KeyframeSpline, {"method": "geodesic", **KEYED, "group": SE3}),
+    "KeyframeSpline.evaluate": (KeyframeSpline("SE3Up", **KEYED).evaluate, {"t": T, "derivatives": 2}),
     "consistent_signs": (torchspline.consistent_signs, {"points": POSE, "group": SE3}),
     "phantom_points": (torchspline.phantom_points, {"keyframes": POSE, "group": SE3}),
     "initial_control_points": (

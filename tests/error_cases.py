@@ -39,7 +39,7 @@ from error_arguments import (
 )
 
 import torchspline.io as records
-from torchspline import SO3, BSpline, Rn
+from torchspline import SE3, SO3, BSpline, Rn
 from torchspline.groups import convert
 
 
@@ -192,6 +192,8 @@ def cases() -> Iterator[Case]:
         yield refused("measure", name, "batch", V[0, :4], f"{name} (4, 3)", "readings (2, 3, 3)")
 
     yield from hermite()
+    yield from nonuniform()
+    yield from keyframes()
     yield from control_points("consistent_signs", "points", POSE, 1)
     yield from control_points("phantom_points", "keyframes", POSE, 2)
     yield refused("phantom_points", "keyframes", "count", POSE[:, :2], "got 2", "at least 3 points", order=6)
@@ -251,6 +253,68 @@ def hermite() -> Iterator[Case]:
     for bad in ("Body", None):
         yield refused("HermiteSpline.evaluate", "frame", "option", bad, f"got {bad!r}", "'body', 'world'")
         yield refused("HermiteSpline.differentials", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
+
+
+def nonuniform() -> Iterator[Case]:
+    for function in ("nonuniform_bspline", "NonuniformBSpline"):
+        yield from control_points(function, "control_points", POSE, 4)
+        yield from wholes(function, "order", 2, 3.5, INF)
+        yield from groups(function)
+        knots = ACCEPTED[function][1]["knots"]
+        for case in tensor(function, "knots", "", mixed="control_points", like=knots):
+            if case.category not in ("shape", "mixed dtype"):  # float32 knots are numbers like any other
+                yield case
+        for bad in (knots[:-1], knots[None], knots[0]):
+            yield refused(function, "knots", "shape", bad, f"got {tuple(bad.shape)}", "expected shape (12,)")
+        yield refused(function, "knots", "option", knots.flip(0), "and then", "do not decrease")
+        yield refused(function, "knots", "option", 0 * knots, "got 0.0 to 0.0", "a domain of some duration")
+        often = changed(knots, slice(3, 8), 0.3)
+        yield refused(function, "knots", "option", often, "got 0.3", "at most 4 times")
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+    for function in ("nonuniform_bspline", "NonuniformBSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+        yield from times(function, "control_points", ns=False)
+    function = "NonuniformBSpline.insert_knot"
+    yield from numbers(function, "time")
+    yield refused(function, "time", "time", 0.6, "got 0.6", "inside the domain [0.0, 0.5] s")
+    yield refused(function, "time", "option", 0.0, "got 0.0", "less than 3 times")
+
+
+def keyframes() -> Iterator[Case]:
+    for function in ("interpolate", "KeyframeSpline"):
+        yield from control_points(function, "keyframes", POSE, 2)
+        yield from knot_times(function, "times", "keyframes")
+        for bad in ("spline", "", None, 5):
+            yield refused(function, "method", "option", bad, f"got {bad!r}", "one of LERP, Bezier")
+        for bad in ("SE3", SE3.arithmetic):
+            yield refused(
+                function, "group", "type", bad, f"got {type(bad).__name__}", "expected a torchspline.Group"
+            )
+        yield refused(function, "group", "option", None, "got None", "such as torchspline.SE3")
+        yield refused(function, "group", "option", SE3, "got SE3", "none or R3xSO3", method="SPLIT")
+        for bad in ("Short", "", None, True):
+            yield refused(function, "way", "option", bad, f"got {bad!r}", "'short', 'signs'")
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+        yield refused(function, "ends", "option", "natural", "got ends", "it has none")
+        for bad in ("Natural", None):
+            wrong = {"method": "composite_bezier", "ends": bad}
+            yield refused(function, "ends", "option", bad, f"got {bad!r}", "'natural', 'clamped'", **wrong)
+        two = {"keyframes": POSE[:, :2], "times": STAMPS[:2]}
+        yield refused(
+            function, "keyframes", "count", two["keyframes"], "got 2", "at least 3 ",
+            method="squad", times=two["times"],
+        )  # fmt: skip
+    for function in ("interpolate", "KeyframeSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+        yield from times(function, "keyframes", ns=False)
 
 
 def screws() -> Iterator[Case]:

@@ -86,7 +86,7 @@ FREE = {
     "device": "goes straight to PyTorch, which lists the devices there are",
     "source": "goes into messages as it is",
     "name": "goes into messages as it is",
-    "options": "those of BSpline, tried one by one",
+    "options": "those of BSpline or of a scheme, tried one by one",
 }
 
 _MAKERS = "Group Rn product use_kernels"
@@ -108,24 +108,28 @@ _QUATERNION = (
 )
 _POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} {_DUAL} from_scipy"
 _NEW = "Group.identity Group.random"
-_HERMITE = "HermiteSpline.evaluate HermiteSpline.differentials"
+_HERMITE = (
+    "HermiteSpline.evaluate HermiteSpline.differentials NonuniformBSpline.evaluate KeyframeSpline.evaluate"
+)
 _AT_TIMES = f"{_HERMITE} BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_INSERT = "NonuniformBSpline.insert_knot"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
 
 #: Where a kind of mistake cannot be made: category -> reason -> functions.
 NOT_APPLICABLE = {
     "shape": {
-        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS}",
+        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_INSERT}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
     },
     "dtype": {
-        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS}",
+        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_INSERT}",
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
-        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} consistent_signs phantom_points",
+        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_INSERT} "
+        "consistent_signs phantom_points",
         "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
     },
     "nan": {
@@ -135,16 +139,16 @@ NOT_APPLICABLE = {
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
         "from_screw from_scipy read_imu write_imu ImuRecord",
-        "control points and mount were checked when the trajectory was made": _AT_TIMES,
+        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} {_INSERT}",
         "rows stay as they are until they are used": "PoseRecord",
     },
     "count": {
-        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} measure",
+        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_INSERT} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
     },
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
-        "SplitBSpline HermiteSpline Trajectory.mounted Mounted",
+        "SplitBSpline HermiteSpline NonuniformBSpline KeyframeSpline Trajectory.mounted Mounted",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
         "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
     },

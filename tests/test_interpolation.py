@@ -6,7 +6,7 @@ import batteries as kit
 import pytest
 import scipy.interpolate
 import torch
-from batteries import GROUPS, normal
+from batteries import normal
 from oracles import body_rates
 from scipy.spatial.transform import Rotation, Slerp
 from spline_cases import close
@@ -69,8 +69,10 @@ def test_declared_properties(name, times):
     continuous = declared.derivatives if declared.continuity is None else declared.continuity
     for r in range(1, 4):
         jump = (before[r] - after[r]).abs().amax(-1)
-        assert (jump.max() < 3e-4) == (r <= continuous), f"derivative {r} jumps by {jump.max():.1e}"
-        assert jump.max() < 3e-4 or jump.min() > 1e-3 or before[r].abs().max() == 0, "at every key or at none"
+        if r <= continuous:
+            assert jump.max() < 3e-4, f"derivative {r} jumps by {jump.max():.1e}"
+        elif r == continuous + 1:
+            assert jump.min() > 1e-3, f"derivative {r} does not jump at every key"
 
     moved = spline.keyframes.clone()
     moved[3] = group.compose(moved[3], group.exp(kit.tangents(group, [0.2], each=1, seed=5))[0])
@@ -84,7 +86,7 @@ def test_declared_properties(name, times):
 
 
 @each_scheme
-@pytest.mark.parametrize("group", [g for g in GROUPS if g.name != "SO3xSE3"], ids=str)
+@pytest.mark.parametrize("group", [*kit.FIXED, R3, Group("R3xSO3")], ids=str)
 def test_rates_on_every_group(scheme, group):
     """Velocity, acceleration and jerk by nested forward mode through matrices."""
     keys, t = keyframes(group, 5, seed=2), torch.tensor([0.1, 0.9, 2.0, 3.3], dtype=float64)

@@ -237,7 +237,7 @@ class NonuniformBSpline(Trajectory):
             derivatives=derivatives, extrapolate=self.extrapolate, validate=self.validate,
         )  # fmt: skip
 
-    def refined(self, time: float) -> "NonuniformBSpline":
+    def insert_knot(self, time: float) -> "NonuniformBSpline":
         """The spline with one more knot, and control point, at `time` inside the domain (Boehm's knot insertion).
 
         On a commutative group the curve stays as it is; on others it stays outside `order - 1` segments around, and
@@ -257,7 +257,6 @@ class NonuniformBSpline(Trajectory):
                 f"time: expected a knot that comes less than {k - 1} times, got {time!r}, which comes {there}"
             )
         m = int(torch.searchsorted(knots, torch.tensor(time, dtype=knots.dtype), right=True)) - 1
-        m = min(m, self.control_points.shape[-2] - 1)
         points = signs_continued(self.control_points.detach(), self.group)
         # Point i moves towards its successor by the share of its support that lies before the new knot.
         i = torch.arange(m - k + 2, m - there + 1)

@@ -49,10 +49,10 @@ def rates_at_keys(group: Group, keys: Tensor, h: Tensor, ends: str) -> Tensor:
     diagonal = 2.0 * (pad(w, (0, 1)) + pad(w, (1, 0)))
     system = torch.diag(diagonal) + torch.diag(w, 1) + torch.diag(w, -1)
     if ends == "natural":
-        return torch.linalg.solve(system, right)
+        return _solve(system, right)
     inner = system[1:-1, 1:-1]
     if ends == "clamped":
-        return pad(torch.linalg.solve(inner, right[..., 1:-1, :]), (0, 0, 1, 1))
+        return pad(_solve(inner, right[..., 1:-1, :]), (0, 0, 1, 1))
     # The last rate is the first one, up to the sign in which the keys return; what the ends lack they give each other.
     sign = returning_sign(group, keys)
     right = torch.cat([right[..., :1, :] + sign * right[..., -1:, :], right[..., 1:-1, :]], dim=-2)
@@ -60,9 +60,17 @@ def rates_at_keys(group: Group, keys: Tensor, h: Tensor, ends: str) -> Tensor:
     closed[0, 0] = closed[0, 0] + diagonal[-1]
     corner = torch.zeros_like(closed)
     corner[0, count - 2], corner[count - 2, 0] = w[-1], w[-1]
-    flipped = torch.linalg.solve(closed - corner, right)
-    rates = torch.where(sign > 0, torch.linalg.solve(closed + corner, right), flipped)
+    flipped = _solve(closed - corner, right)
+    rates = torch.where(sign > 0, _solve(closed + corner, right), flipped)
     return torch.cat([rates, sign * rates[..., :1, :]], dim=-2)
+
+
+def _solve(system: Tensor, right: Tensor) -> Tensor:
+    """Not by `torch.linalg.solve`, whose forward mode of forward mode is wrong (torch 2.13)."""
+    factors, pivots = torch.linalg.lu_factor(system)
+    return torch.linalg.lu_solve(
+        factors.expand(*right.shape[:-2], -1, -1), pivots.expand(*right.shape[:-2], -1), right
+    )
 
 
 def returning_sign(group: Group, keys: Tensor) -> Tensor:
