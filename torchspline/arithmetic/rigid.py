@@ -31,7 +31,7 @@ class RigidMotion(AdjointSeriesGroup):
         v, w = x[:3], x[3:]
         back = so3.full_turn_back(w, far)
         size2 = dot(w, w)
-        along = dot(v, w) / where(far & (size2 > 0), size2, 1.0)
+        along = dot(v, w) / where(far & (-size2 < 0.0), size2, 1.0)
         return (*add(v, scale(back, add(v, scale(-along, w)))), *add(w, scale(back, w)))
 
     def act(self, X: Vector, point: Vector) -> Vector:

@@ -89,7 +89,7 @@ def unit(q: Vector) -> Vector:
 def full_turn_back(x: Vector, far: Scalar) -> Scalar:
     """-2 pi / |x| on the far side, else 0; 0 too at minus the identity, which turns about no axis."""
     size2 = dot(x, x)
-    turning = far & (size2 > 0)
+    turning = far & (-size2 < 0.0)  # `>` would be a far path to the tracer
     return where(turning, -6.283185307179586 / sqrt(where(turning, size2, 1.0)), 0.0)
 
 

@@ -26,5 +26,6 @@ class Geodesic(Scheme):
 
     def fields(self, group: Group, rows: Tensor, u: Tensor, derivatives: int) -> tuple[Tensor, ...]:
         start, step = rows.split([group.point_size, group.tangent_size], dim=-1)
-        weights = torch.stack([u, torch.ones_like(u), *[torch.zeros_like(u)] * 2], dim=-1)
-        return geodesics(group.name, start, step.unsqueeze(-2), weights[..., : derivatives + 1, None])
+        rates = u.new_tensor([1.0, 0.0, 0.0][:derivatives]).expand(*u.shape, derivatives)
+        weights = torch.cat([u.unsqueeze(-1), rates], dim=-1)
+        return geodesics(group.name, start, step.unsqueeze(-2), weights.unsqueeze(-1))
