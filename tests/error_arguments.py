@@ -152,6 +152,10 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"T_body_sensor": POSE[0, 0], "t": T, "derivatives": 2},
     ),
     "measure": (imu.measure, {"trajectory": SPLINE, "t": T}),
+    "geodesic_product": (
+        torchspline.functional.geodesic_product,
+        {"start": POSE, "steps": TANGENT[..., None, :], "weights": TANGENT[..., :2, None], "group": SE3},
+    ),
     "hermite": (torchspline.functional.hermite, {**KNOTS, "t": T, "coordinates": "product", "frame": "body"}),
     "HermiteSpline": (HermiteSpline, {**KNOTS, "coordinates": "logarithm", "frame": "world"}),
     "HermiteSpline.evaluate": (HERMITE.evaluate, {"t": T, "derivatives": 2, "frame": "world"}),

@@ -78,7 +78,10 @@ def cases() -> Iterator[Case]:
             continue  # sequences and records come below
         together = [name for name, x in good.items() if isinstance(x, torch.Tensor)]
         for name in together:
-            if name in ("s", "exponent", "matrix", "T_body_sensor") or function == "from_screw":
+            if name in ("s", "exponent", "matrix", "T_body_sensor") or function in (
+                "from_screw",
+                "geodesic_product",
+            ):
                 continue
             start = quaternions.get(name)
             width = good[name].shape[-1]
@@ -191,6 +194,7 @@ def cases() -> Iterator[Case]:
         yield refused("measure", name, "shape", (0.0, 9.8), "got (2,)", "expected shape (..., 3)")
         yield refused("measure", name, "batch", V[0, :4], f"{name} (4, 3)", "readings (2, 3, 3)")
 
+    yield from geodesics()
     yield from hermite()
     yield from nonuniform()
     yield from keyframes()
@@ -226,6 +230,19 @@ def knot_times(function: str, argument: str, what: str) -> Iterator[Case]:
     yield refused(function, argument, "option", good.flip(0), "and then", "increasing times")
     yield refused(function, argument, "option", 0 * good, "got 0.0 and then 0.0", "drop duplicates")
     yield refused(function, argument, "device", good.to("meta"), "meta", "cpu")
+
+
+def geodesics() -> Iterator[Case]:
+    function = "geodesic_product"
+    good = ACCEPTED[function][1]
+    yield from tensor(function, "start", " (..., 7)", slice(3, 7), "steps")
+    for name, size in (("steps", " (..., n, 6)"), ("weights", " (..., R + 1, 1)")):
+        yield from tensor(function, name, size, None, "start")
+        yield refused(function, name, "batch", good[name][:, :3], f"{name} (2, 3)", "start (2, 8)")
+    none, five = good["steps"][..., :0, :], TANGENT[..., :5, None]
+    yield refused(function, "steps", "count", none, "got (2, 8, 0, 6)", "n tangents")
+    yield refused(function, "weights", "count", five, "got (2, 8, 5, 1)", "from 0 to 3 derivatives")
+    yield from groups(function)
 
 
 def hermite() -> Iterator[Case]:

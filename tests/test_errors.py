@@ -112,6 +112,8 @@ _HERMITE = (
     "HermiteSpline.evaluate HermiteSpline.differentials NonuniformBSpline.evaluate KeyframeSpline.evaluate"
 )
 _AT_TIMES = f"{_HERMITE} BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_SPLINES = "BSpline SplitBSpline HermiteSpline NonuniformBSpline KeyframeSpline"
+_TIMELESS = f"geodesic_product consistent_signs phantom_points {_SPLINES} Trajectory.mounted Mounted"
 _INSERT = "NonuniformBSpline.insert_knot"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
@@ -147,8 +149,7 @@ NOT_APPLICABLE = {
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
     },
     "time": {
-        "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
-        "SplitBSpline HermiteSpline NonuniformBSpline KeyframeSpline Trajectory.mounted Mounted",
+        "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} {_TIMELESS}",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
         "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
     },

@@ -13,6 +13,7 @@ import torchspline
 from torchspline.arithmetic import jet
 from torchspline.arithmetic.jet import Jet
 from torchspline.arithmetic.scalar import cos, sin, sqrt, where
+from torchspline.functional import geodesic_product
 from torchspline.groups.components import join, split
 from torchspline.groups.operations import geodesics, operation_of, run
 
@@ -95,7 +96,7 @@ def product_arguments(group, count, derivatives, rows, seed=0):
 def test_products_of_geodesics(group, count):
     """Any weights, steps beyond pi: [E17] (24), (33), (36) in the body frame, and the jerk, by the product rule."""
     start, steps, weights = product_arguments(group, count, 3, 6)
-    value, *rates = geodesics(group.name, start, steps, weights)
+    value, *rates = geodesic_product(start, steps, weights, group=group)
     rows = [row.unbind(-1) for row in weights.unbind(1)]
     for i in range(6):
         of_row = [[w[i : i + 1] for w in row] for row in rows]
