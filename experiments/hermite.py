@@ -1,9 +1,8 @@
 """Quintic Hermite splines: what [E17] promises, measured.
 
 Boundary conditions, continuity across joints, differentials, and the order in which a spline through samples
-of a smooth
-motion approaches that motion; then [E17]'s motivating example, a spline on SE(3) fitted to a gyroscope and an
-accelerometer.
+of a smooth motion approaches that motion; then [E17]'s motivating example, a spline on SE(3) fitted to a
+gyroscope and an accelerometer.
 """
 
 from pathlib import Path

@@ -74,8 +74,7 @@ class GroupArithmetic(ABC):
         """The x with Exp(x) = X, signs of numbers included: beyond pi, up to 2 pi, where they lie on the far side.
 
         On the double cover, as on SU(2) in [H18] (11)-(13). At minus the identity, where no axis is nearer
-        than another,
-        that of the identity; it jumps there.
+        than another, that of the identity; it jumps there.
         """
         return self.log(X)
 

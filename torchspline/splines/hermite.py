@@ -3,9 +3,8 @@
 Two curves between the same ends, the same on a commutative group:
 
 * `coordinates="product"`, [E17] (59)-(81): `X_0 Exp(a_1 p_1) ... Exp(a_5 p_5)` with p_1 = Log(X_0^-1 X_1), p_2
-  and p_3 the
-  velocities, p_4 and p_5 the accelerations at the ends. Third order where the factors do not commute (a smooth motion
-  sampled h apart is met to h^3, its velocity to h^2, its acceleration to h);
+  and p_3 the velocities, p_4 and p_5 the accelerations at the ends. Third order where the factors do not
+  commute (a smooth motion sampled h apart is met to h^3, its velocity to h^2, its acceleration to h);
 * `coordinates="logarithm"`: `X_0 Exp(phi)` with one quintic phi in the tangent space of X_0. Sixth order.
 
 [E17] multiplies on the left and differentiates in the world frame; here products and rates are those of the body frame,
@@ -159,8 +158,7 @@ def hermite(
 
     Args:
         values: `(*batch, M, P)` points of `group` at the knots, M >= 2; quaternions of any length and sign,
-            neighbours are
-            joined the short way round.
+            neighbours are joined the short way round.
         velocities, accelerations: `(*batch, M, D)` at the knots, per second and per second squared.
         t: `()`, `(N,)` or `(*batch, N)` seconds within the knots; float32 only while its rounding stays below a
             thousandth of the shortest segment.
@@ -266,8 +264,8 @@ class HermiteSpline(Trajectory):
 
     Args:
         values: `(*batch, M, P)`; velocities, accelerations: `(*batch, M, D)`; see `hermite`. Tensors that
-            require grad and
-            Parameters are used as given, others copied into Parameters, or buffers if not `learnable`.
+            require grad and Parameters are used as given, others copied into Parameters, or buffers if not
+            `learnable`.
         group, coordinates, frame, extrapolate, validate: as in `hermite`.
         times: `(M,)` seconds, kept in float64; a tensor that requires grad is used as given.
         learnable: whether tensors that do not require grad become Parameters; never the times.

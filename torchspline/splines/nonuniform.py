@@ -1,8 +1,7 @@
 """Cumulative B-splines on any Lie group over any knot vector: repeated knots, knot insertion, gradients by knots.
 
 The curve is that of [S20] Definition 5.1, with the cumulative sums of the general basis functions of Cox and
-de Boor (in
-[H18] section 3) for the matrix of uniform ones.
+de Boor (in [H18] section 3) for the matrix of uniform ones.
 """
 
 from typing import Any
@@ -127,8 +126,7 @@ def nonuniform_bspline(
     Returns:
         State: as of `bspline`. At a knot the derivatives from the right, at the last one from the left.
     Differentiable in control points, float `t` and knots, to any order; not in repeated knots, where curves of
-    different
-    smoothness meet.
+    different smoothness meet.
     Raises:
         TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
     """
@@ -190,8 +188,7 @@ class NonuniformBSpline(Trajectory):
 
     Args:
         control_points: `(*batch, M, P)`; tensors that require grad and Parameters are used as given, others
-            copied into a
-            Parameter, or a buffer if not `learnable`.
+            copied into a Parameter, or a buffer if not `learnable`.
         group, order, extrapolate, validate: as in `nonuniform_bspline`.
         knots: `(M + order,)` seconds, kept in float64; a tensor that requires grad is used as given.
         learnable: whether control points that do not require grad become a Parameter; never the knots.
