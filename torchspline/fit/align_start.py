@@ -184,7 +184,7 @@ def _correlation(x: Array, y: Array, there: Array, step: float, least: float) ->
     vx, vy = sxx - sx * sx / n, syy - sy * sy / n
     floor = 1e-9 * max(float(np.sum(x * x)), 1e-300), 1e-9 * max(float(np.sum(y * y)), 1e-300)
     r = (sums(fx, fy) - sx * sy / n) / np.sqrt(np.maximum(vx, floor[0]) * np.maximum(vy, floor[1]))
-    score = np.arctanh(np.clip(r, -1.0, 1.0 - 1e-6)) * np.sqrt(n)
+    score = np.arctanh(np.clip(r, -1.0 + 1e-6, 1.0 - 1e-6)) * np.sqrt(n)
     return shifts, np.where(n * step >= least, score, -np.inf)
 
 
