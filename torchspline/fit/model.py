@@ -118,6 +118,13 @@ class Model:
             self.columns[id(variable)] = columns.reshape(-1, variable.dimension)
             self.total += count
 
+    def columns_of(self, unknown: Unknown) -> Array:
+        """Of its control points or its rows (C, D); -1 for those that stay."""
+        if id(unknown) in self.columns:
+            return self.columns[id(unknown)]
+        assert isinstance(unknown, Variable)
+        return np.full((unknown.value.shape[:-1].numel(), unknown.dimension), -1, np.int64)
+
     def state(self) -> State:
         """The numbers as they stand in the modules."""
         points = {

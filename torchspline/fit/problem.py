@@ -1,7 +1,6 @@
 """A least-squares problem: a trajectory, what was measured of it, and what else is unknown."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.fit.bends import Bends
 from torchspline.fit.model import Model, Spline, State, Unknown
-from torchspline.fit.residual import Residual
+from torchspline.fit.priors import BoundPrior, Part, Prior
+from torchspline.fit.progress import progress_bar
+from torchspline.fit.residual import Residual, square_root_information, weighting_of
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, Trace, minimise
+from torchspline.fit.solver import Options, minimise
 from torchspline.fit.system import BandSystem, SparseSystem, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
@@ -39,6 +41,7 @@ class Problem:
         self._indices: list[dict[str, Array]] = []
         self._frozen: dict[int, Array | bool] = {}
         self._unknowns: list[Unknown] = [trajectory]
+        self._priors: list[Prior] = []
 
     # ------------------------------------------------------------------ building
 
@@ -97,6 +100,38 @@ class Problem:
                 f"t: {int(outside.sum())} of {outside.numel()} times of {residual.name} lie outside the trajectory's "
                 f"domain {list(domain)}, the first is {t[outside][0].item()!r}; leave them out or extend the trajectory"
             )
+
+    def add_prior(
+        self,
+        variable: Variable,
+        *,
+        sigma: Tensor | float | None = None,
+        covariance: Tensor | None = None,
+        information: Tensor | None = None,
+    ) -> None:
+        """Say beforehand how far a variable may be from where it stands now.
+
+        Args:
+            variable: any, also one that a residual added later depends on; each of several by itself.
+            sigma: standard deviation of its steps (a body tangent, plain numbers, or two angles of a direction, rad):
+                a number or (dimension,). covariance, information: instead, (dimension, dimension).
+        Raises:
+            TypeError, ValueError: a wrong type, shape or value, or none of the three.
+        """
+        checks.instance("variable", variable, Variable, "a torchspline.fit.Variable")
+        if sigma is None and covariance is None and information is None:
+            raise ValueError("sigma, covariance, information: expected one of them, got none")
+        size, count = variable.dimension, variable.value.shape[:-1].numel()
+        root = square_root_information(weighting_of(sigma, covariance, information, size, count))
+        assert root is not None
+        root = root.detach().cpu()
+        matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
+        if matrix.shape != (size, size):
+            raise ValueError(f"sigma: expected a number or shape ({size},), got one for each of several")
+        self._register(variable)
+        reference = variable.points(variable.value).reshape(count, -1)
+        H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
+        self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
 
     def freeze(self, unknown: Unknown, points: Tensor | None = None) -> None:
         """Keep an unknown as it is: a `Variable`, or control points of a spline.
@@ -164,7 +199,7 @@ class Problem:
         if not self.residuals:
             raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
         options = Options(max_iterations, cost_tolerance, gradient_tolerance, damping)
-        with torch.no_grad(), _bar(progress, max_iterations) as show:
+        with torch.no_grad(), progress_bar(progress, max_iterations) as show:
             linearizer = self.prepare()
             model = linearizer.model
             if model.total == 0:
@@ -180,23 +215,20 @@ class Problem:
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, self._frozen)
         terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
-        return Linearizer(model, terms)
+        return Linearizer(model, [*terms, *(prior.bind(model) for prior in self._priors)])
 
 
 class Linearizer:
     """From numbers of the unknowns to normal equations."""
 
-    def __init__(self, model: Model, terms: list[Term]):
-        self.model, self.terms = model, terms
+    def __init__(self, model: Model, terms: Sequence[Term | Bends | BoundPrior]):
+        self.model, self.terms = model, list(terms)
         self.fused = model.trajectory.local.fused
 
     def __call__(self, state: State) -> System:
         system = self._empty(state)
         for term in self.terms:
-            for cost, rows, _ in term.linearize(state):
-                system.cost += cost
-                assert state.chain is not None
-                system.add(rows, state.chain)
+            term.add_to(system, state)
         return system
 
     def _empty(self, state: State) -> System:
@@ -204,7 +236,7 @@ class Linearizer:
         model = self.model
         width = narrow = 1
         for term in self.terms:
-            columns = term.places(state).columns
+            columns = term.touched(state)
             if columns.size == 0:
                 continue
             spline = np.where(columns < model.band, columns, -1)
@@ -240,20 +272,3 @@ def _index(residual: Residual, slot: str, x: Any) -> Array:
             f"{slot}: expected indices from 0 to {count - 1}, got {index.min()} to {index.max()}"
         )
     return index
-
-
-@contextmanager
-def _bar(shown: bool, total: int) -> Iterator[Any]:
-    """A function to call after each iteration, with a progress bar on a terminal."""
-    if not shown:
-        yield lambda trace: None
-        return
-    from rich.progress import Progress
-
-    with Progress(transient=True) as bar:
-        task = bar.add_task("solving", total=total)
-
-        def show(trace: Trace) -> None:
-            bar.update(task, completed=len(trace.cost) - 1, description=f"solving, cost {trace.cost[-1]:.6g}")
-
-        yield show

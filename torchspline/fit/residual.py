@@ -129,7 +129,7 @@ class Residual(ABC):
                 f"measured: expected shape ({count}, {measured_size}), got {tuple(self.measured.shape)}"
             )
         checks.quaternions("measured", self.measured, signs)
-        self.weighting = _weighting(*self._weights, rows, count)
+        self.weighting = weighting_of(*self._weights, rows, count)
 
     def bind(self, group: Group) -> None:
         """Check that the residual makes sense on trajectories of this group; called by `Problem.add`."""
@@ -204,7 +204,7 @@ def _check_measured(t: Tensor, measured: Tensor, moments: int) -> None:
     checks.finite("measured", measured)
 
 
-def _weighting(
+def weighting_of(
     sigma: Any, covariance: Tensor | None, information: Tensor | None, rows: int, count: int
 ) -> tuple[str, Tensor | None]:
     """Which of the three was given, checked, and its tensor; ("sigma", None) stands for one."""
@@ -247,7 +247,7 @@ def _weighting(
 
 
 def square_root_information(weighting: tuple[str, Tensor | None]) -> Tensor | None:
-    """W with W^T W the information: None for one, (...,) or (..., R) factors, or (..., R, R) matrices. Differentiable."""
+    """W with W^T W the information: None for one, factors (...,) or (..., R), or matrices (..., R, R)."""
     kind, x = weighting
     if x is None:
         return None

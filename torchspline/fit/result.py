@@ -1,29 +1,220 @@
-"""What a solution says about itself."""
+"""What a solution says about itself: how it went, how sure it is, and what the data leave open."""
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from torchspline.fit.model import State
+from torchspline import checks
+from torchspline.fit.model import State, Unknown
 from torchspline.fit.solver import Trace
-from torchspline.fit.system import System
+from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.terms import Term
+from torchspline.fit.variables import Variable
 
 if TYPE_CHECKING:
     from torchspline.fit.problem import Linearizer
 
 Array = NDArray[Any]
+#: Eigenvalues of the normal equations, scaled to a diagonal of ones, below which a direction counts as left open: its
+#: standard deviation is 30,000 times what it would be if all else were known.
+_OPEN = 1e-9
+#: Directions that are looked for.
+_DIRECTIONS = 12
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of unknowns that the measurements do not determine."""
+
+    #: Eigenvalue of the scaled normal equations: 0 is not at all.
+    eigenvalue: float
+    #: Which unknowns it moves: share of its squared length, by name ("trajectory", "spline 1", names of variables).
+    shares: dict[str, float]
+    #: How it moves them: (M, D) for splines, (L, dimension) for variables; the largest number is 1.
+    steps: dict[str, Tensor]
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{name} {share:.0%}" for name, share in self.shares.items() if share >= 0.01)
+        return f"not determined (eigenvalue {self.eigenvalue:.1e}): {parts}"
 
 
 class Result:
-    """Of `Problem.solve`."""
+    """Of `Problem.solve`. Covariances hold at the solution, for the standard deviations that were given."""
 
     def __init__(self, linearizer: "Linearizer", state: State, system: System, trace: Trace):
-        self._linearizer, self._state, self._system, self._trace = linearizer, state, system, trace
+        self._linearizer, self._state, self._system = linearizer, state, system
         #: Half the (robust) weighted sum of squares at the start and after each accepted step.
         self.cost = list(trace.cost)
+        #: Damping along with it.
+        self.damping = list(trace.damping)
         #: How often residuals and Jacobians were evaluated.
         self.evaluations = trace.evaluations
         #: Why it stopped, and whether that was convergence.
         self.reason, self.converged = trace.reason, trace.converged
         #: Wall time by phase, s.
         self.seconds = dict(trace.seconds)
+
+    def __repr__(self) -> str:
+        return (
+            f"Result(cost {self.cost[0]:.6g} -> {self.cost[-1]:.6g} in {self.evaluations} evaluations, "
+            f"{'converged' if self.converged else 'not converged'}: {self.reason})"
+        )
+
+    # ------------------------------------------------------------------ residuals
+
+    @cached_property
+    def residuals(self) -> dict[str, Tensor]:
+        """Of every residual added, by name, (N, R) in the order of its measurements, not weighted.
+
+        A second residual of one name gets " 2" after it, and so on.
+        """
+        found: dict[str, Tensor] = {}
+        for term in self._terms():
+            rows = torch.from_numpy(np.concatenate([r for _, _, r in term.linearize(self._state)]))
+            name, count = term.residual.name, 2
+            while name in found:
+                name, count = f"{term.residual.name} {count}", count + 1
+            found[name] = torch.empty_like(rows).index_copy(0, torch.from_numpy(term.order), rows)
+        return found
+
+    @cached_property
+    def outside(self) -> int:
+        """Measurements that an estimated clock moved out of the trajectory's domain; they had no weight."""
+        return sum(int(term.places(self._state).outside.sum()) for term in self._terms())
+
+    def _terms(self) -> list[Term]:
+        return [term for term in self._linearizer.terms if isinstance(term, Term)]
+
+    @property
+    def variance_factor(self) -> float:
+        """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
+        rows = sum(len(term) * term.kernel_rows() for term in self._terms())
+        return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
+
+    # ------------------------------------------------------------------ how sure
+
+    @cached_property
+    def _factor(self) -> Factor:
+        try:
+            return self._system.factor(np.zeros(self._linearizer.model.total))
+        except SingularError:
+            open_ = "; ".join(map(str, self.observability)) or "rounding leaves no direction to name"
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}") from None
+
+    def _determined(self) -> Factor:
+        if self.observability:
+            raise ValueError(
+                f"covariance: the measurements do not determine all unknowns: {'; '.join(map(str, self.observability))}"
+            )
+        return self._factor
+
+    def covariance(self, variable: Variable) -> Tensor:
+        """Of a variable's step: `(dimension, dimension)`, or `(L, dimension, dimension)` for several.
+
+        In plain numbers; a body tangent for a point of a group; two angles [rad] for a direction.
+
+        Raises:
+            ValueError: it was frozen, or the measurements do not determine all unknowns (the message says which).
+        """
+        checks.instance("variable", variable, Variable, "a torchspline.fit.Variable")
+        columns = self._linearizer.model.columns.get(id(variable))
+        if columns is None:
+            raise ValueError(f"variable: {variable.name} is not among the unknowns that were solved for")
+        i, j = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+        blocks = torch.from_numpy(self._determined().inverse(i, j))
+        return blocks[0] if variable.value.ndim == 1 else blocks
+
+    def standard_deviation(self, variable: Variable) -> Tensor:
+        """Square roots of the diagonal of `covariance`."""
+        return self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
+        """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.
+
+        Of the value's body tangent, then of the derivatives (body frame, per second).
+
+        Raises:
+            ValueError: a time outside the domain; the measurements do not determine all unknowns.
+        """
+        model = self._linearizer.model
+        spline, trajectory = model.trajectory, model.trajectory.module
+        jacobians = trajectory.jacobians(t, derivatives, side="right")
+        stacked = torch.cat([x for x in jacobians[1 : 2 + derivatives] if x is not None], dim=-2).double()
+        N, k, rows, D = stacked.reshape(-1, *stacked.shape[-3:]).shape
+        J = stacked.reshape(N, k, rows, D).transpose(1, 2).reshape(N, rows, k * D).numpy()
+        windows = jacobians.first.reshape(-1).numpy()[:, None] + np.arange(spline.order)
+        columns = model.columns[id(trajectory)][windows].reshape(N, k * D)
+        # Control points that stay have no variance; any column stands in for theirs.
+        J = np.where((columns >= 0)[:, None], J, 0.0)
+        columns = np.where(columns >= 0, columns, np.maximum(columns.max(axis=1, keepdims=True), 0))
+        i, j = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+        covariance = torch.from_numpy(J @ self._determined().inverse(i, j) @ J.swapaxes(1, 2))
+        return covariance[0] if t.ndim == 0 else covariance
+
+    # ------------------------------------------------------------------ what is left open
+
+    @cached_property
+    def observability(self) -> list[Direction]:
+        """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
+        diagonal = self._system.diagonal()
+        dead = np.flatnonzero(diagonal <= 0)
+        found = []
+        if len(dead):
+            step = np.zeros(len(diagonal))
+            step[dead] = 1.0
+            found.append(self._direction(0.0, step))
+        scale = np.where(diagonal > 0, 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+        for value, vector in self._smallest(scale, dead):
+            if value < _OPEN:
+                found.append(self._direction(value, scale * vector))
+        return found
+
+    def _smallest(self, scale: Array, dead: Array) -> list[tuple[float, Array]]:
+        """Smallest eigenvalues of the scaled normal equations and their vectors, by inverse iteration on a subspace."""
+        total = len(scale)
+        count = min(_DIRECTIONS, total - len(dead))
+        if count <= 0:
+            return []
+        shift = 1e-11
+        damping = shift / scale**2
+        damping[dead] = 1.0
+        factor = self._system.factor(damping)
+        basis = np.random.default_rng(0).normal(size=(total, min(count + 4, total - len(dead))))
+        basis[dead] = 0.0
+        for _ in range(8):
+            basis, _ = np.linalg.qr(basis)
+            basis = factor.solve(basis / scale[:, None]) / scale[:, None]
+            basis[dead] = 0.0
+        basis, _ = np.linalg.qr(basis)
+        image = np.stack([scale * self._system.multiply(scale * b) for b in basis.T], axis=1)
+        values, rotation = np.linalg.eigh(basis.T @ image)
+        vectors = basis @ rotation
+        return [(max(float(v), 0.0), x) for v, x in zip(values[:count], vectors.T, strict=False)]
+
+    def _direction(self, value: float, step: Array) -> Direction:
+        step = step / max(np.abs(step).max(), 1e-300)
+        model, shares, steps = self._linearizer.model, {}, {}
+        diagonal = np.sqrt(np.maximum(self._system.diagonal(), 0.0))
+        diagonal = np.where(diagonal > 0, diagonal, 1.0)
+        weight = np.square(step * diagonal)
+        for name, unknown in self._named():
+            columns = model.columns.get(id(unknown))
+            if columns is None:
+                continue
+            there = columns >= 0
+            shares[name] = float(weight[columns[there]].sum() / weight.sum())
+            steps[name] = torch.from_numpy(np.where(there, step[columns], 0.0))
+        return Direction(value, dict(sorted(shares.items(), key=lambda x: -x[1])), steps)
+
+    def _named(self) -> list[tuple[str, Unknown]]:
+        model = self._linearizer.model
+        names: list[tuple[str, Unknown]] = [
+            ("trajectory" if i == 0 else f"spline {i}", spline.module)
+            for i, spline in enumerate(model.splines)
+        ]
+        return names + [(variable.name, variable) for variable in model.variables]

@@ -4,16 +4,27 @@
 """
 
 from abc import ABC, abstractmethod
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchspline.fit.model import Model
-from torchspline.fit.terms import Rows
 from torchspline.kernels.assemble import add_to_band, add_to_blocks
 
 Array = NDArray[Any]
+
+
+class Rows(NamedTuple):
+    """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
+
+    rows: Array
+    starts: Array
+    bases: Array
+    columns: Array
+    #: Control points that a row's local coordinates span.
+    span: int
 
 
 class SingularError(Exception):
@@ -27,14 +38,19 @@ class Factor(ABC):
     def solve(self, right: Array) -> Array:
         """For right sides `(total,)` or `(total, C)`."""
 
+    @abstractmethod
+    def inverse(self, i: Array, j: Array) -> Array:
+        """Elements of the inverse at columns `i`, `j` of one shape, tied together by measurements or of the border."""
+
 
 class System(ABC):
     """`J^T J` and `J^T r`, added up chunk by chunk."""
 
     def __init__(self, model: Model, fused: bool):
         self.model, self.fused = model, fused
-        self.right = np.zeros(model.total)
+        #: Half the sum of squares.
         self.cost = 0.0
+        self.right = np.zeros(model.total)
 
     @abstractmethod
     def add(self, rows: Rows, chain: Array) -> None:
@@ -75,9 +91,8 @@ class BandSystem(System):
         self.border, self.corner = np.zeros((n, m)), np.zeros((m, m))
 
     def add(self, rows: Rows, chain: Array) -> None:
-        group, k = self.model.trajectory.group, self.model.trajectory.order
         outside = add_to_band(
-            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns,
+            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns,
             self.band, self.border, self.corner, self.right,
         )  # fmt: skip
         if outside:
@@ -152,6 +167,53 @@ class BandFactor(Factor):
         outer = self._lapack.dpotrs(self.corner, outer, lower=1)[0]
         return np.concatenate([inner - self.inverse_border @ outer, outer])
 
+    def inverse(self, i: Array, j: Array) -> Array:
+        """The band of the inverse of the band's factor [Takahashi 1973], corrected for the border."""
+        n, m = self.n, len(self.corner)
+        identity = np.eye(m)
+        corner = self._lapack.dpotrs(self.corner, identity, lower=1)[0] if m else identity
+        # Rows of [-A^-1 B; 1]: how all columns follow those of the border.
+        follow = np.concatenate([-self.inverse_border, identity]) if m else np.zeros((n, 0))
+        result = np.einsum("...a,ab,...b->...", follow[i], corner, follow[j])
+        inner = (i < n) & (j < n)
+        result[inner] += self._band_inverse(i[inner], j[inner])
+        return result
+
+    def _band_inverse(self, i: Array, j: Array) -> Array:
+        i, j = np.maximum(i, j), np.minimum(i, j)
+        diagonal, below = self._inverse_blocks
+        size = diagonal.shape[1]
+        here, there = i // size, j // size
+        if len(i) and int((here - there).max()) > 1:
+            raise ValueError("these columns are too far apart for elements of the inverse to be known")
+        same = here == there
+        first = np.minimum(there, len(below) - 1) if len(below) else there
+        apart = below[first, i % size, j % size] if len(below) else np.zeros(len(i))
+        return np.where(same, diagonal[here, i % size, j % size], apart)
+
+    @cached_property
+    def _inverse_blocks(self) -> tuple[Array, Array]:
+        """The inverse's blocks on the diagonal and below it, as wide as the band."""
+        width, n = self.chol.shape
+        size = max(width - 1, 1)
+        count = -(-n // size)
+        # The factor in blocks: with a band as wide as a block there is one on the diagonal and one below it.
+        dense = np.zeros((count, 2 * size, size))
+        column, down = np.meshgrid(np.arange(n), np.arange(width), indexing="ij")
+        block, at = column // size, column % size
+        keep = column + down < n
+        dense[block[keep], (at + down)[keep], at[keep]] = self.chol.T[column[keep], down[keep]]
+        dense[-1, np.arange(size), np.arange(size)] += np.arange(size) >= n - (count - 1) * size
+        diagonal, below = np.empty((count, size, size)), np.empty((max(count - 1, 0), size, size))
+        for b in reversed(range(count)):
+            inverse = np.linalg.inv(dense[b, :size])
+            diagonal[b] = inverse.T @ inverse
+            if b < count - 1:
+                carried = dense[b, size:] @ inverse
+                below[b] = -diagonal[b + 1] @ carried
+                diagonal[b] += carried.T @ diagonal[b + 1] @ carried
+        return diagonal, below
+
 
 class SparseSystem(System):
     """For distant relative poses and maps of landmarks, whose coupling fits no band."""
@@ -162,11 +224,10 @@ class SparseSystem(System):
         self._matrix: Any = None
 
     def add(self, rows: Rows, chain: Array) -> None:
-        group, k = self.model.trajectory.group, self.model.trajectory.order
         size = rows.columns.shape[1]
         blocks = np.empty((len(rows.columns), size, size))
         add_to_blocks(
-            self.fused, *rows_of(rows), chain, k, group.tangent_size, rows.columns, blocks, self.right
+            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns, blocks, self.right
         )
         i = np.repeat(rows.columns, size, axis=1).reshape(-1)
         j = np.tile(rows.columns, (1, size)).reshape(-1)
@@ -220,6 +281,12 @@ class SparseFactor(Factor):
 
     def solve(self, right: Array) -> Array:
         return self._lu.solve(right)
+
+    def inverse(self, i: Array, j: Array) -> Array:
+        needed, which = np.unique(j, return_inverse=True)
+        unit = np.zeros((self._lu.shape[0], len(needed)))
+        unit[needed, np.arange(len(needed))] = 1.0
+        return self._lu.solve(unit)[i, which.reshape(j.shape)]
 
 
 def rows_of(rows: Rows) -> tuple[Array, Array, Array]:

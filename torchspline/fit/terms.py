@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torchspline.fit.kernel import ResidualKernel, kernel_of
 from torchspline.fit.model import NANOSECOND, Model, State
 from torchspline.fit.residual import Residual, square_root_information
+from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 
@@ -34,15 +35,6 @@ class Places(NamedTuple):
     columns: Array
     #: Trajectory times (moments, N) and how they move with each unknown of the clock.
     rates: list[tuple[Variable, Array]]
-
-
-class Rows(NamedTuple):
-    """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
-
-    rows: Array
-    starts: Array
-    bases: Array
-    columns: Array
 
 
 class Term:
@@ -159,18 +151,31 @@ class Term:
             elif v is clock.skew:
                 rates.append((v, -(tau - self.mid) / rate))
             else:
+                assert self.late is not None
                 rates.append((v, np.broadcast_to(-self.late / rate, tau.shape)))
         return tau, rates
 
     # ------------------------------------------------------------------ what
 
+    def touched(self, state: State) -> Array:
+        """Columns of the unknowns of each run."""
+        return self.places(state).columns
+
+    def add_to(self, system: System, state: State) -> None:
+        """Add cost and normal equations."""
+        assert state.chain is not None
+        for cost, rows, _ in self.linearize(state):
+            system.cost += cost
+            system.add(rows, state.chain)
+
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
-        places = self.places(state)
+        places, span = self.places(state), self.model.trajectory.order
         for begin, stop, first, last in _chunks(places.starts, CHUNK):
             cost, rows, residual = self._chunk(state, places, slice(begin, stop))
             starts = places.starts[first : last + 1] - begin
-            yield cost, Rows(rows, starts, places.bases[first:last], places.columns[first:last]), residual
+            part = Rows(rows, starts, places.bases[first:last], places.columns[first:last], span)
+            yield cost, part, residual
 
     def _chunk(self, state: State, places: Places, part: slice) -> tuple[float, Array, Array]:
         model, kernel = self.model, self.kernel

@@ -18,7 +18,8 @@ class Variable:
 
     Args:
         name: what results and reports call it; unique within a problem.
-        value: where to start, `(n,)`, or `(L, n)` for L unknowns of which each measurement sees one. Solving replaces it.
+        value: where to start, `(n,)`, or `(L, n)` for L unknowns of which each measurement sees one. Solving
+            replaces it.
         group: the group it is a point of; None for plain numbers.
         sphere: whether the length of `value` is known and only its direction is not, as for gravity. Two degrees of
             freedom.

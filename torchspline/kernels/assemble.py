@@ -2,8 +2,8 @@
 
 Queries come in runs that touch the same unknowns. Rows of a run are `[J | r]`: `splines` times k D columns in local
 coordinates (see `linearize.py`), then columns of other unknowns, last the residual. The Gram matrix of a run is summed
-first, moved from local coordinates to control points once, and then added to where its unknowns live. The loops
-below run as Python, too, slowly: tests compare the two.
+first, moved from local coordinates to control points once, and then added to where its unknowns live. Without Numba
+the same is done on whole arrays, at the end of this file.
 """
 
 import inspect
@@ -23,8 +23,9 @@ from numba import njit
 DEPTH = {DEPTH}
 
 '''
-_HELPER = '@njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})\n'
-_ENTRY = '@njit("{signature}", nogil=True, cache={cache}, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})\n'
+_OPTIONS = 'nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}'
+_ENTRY = '@njit("{signature}", cache={cache}, ' + _OPTIONS + ")\n"
+_HELPER = f"@njit({_OPTIONS})\n"
 
 
 #: Rows of a run that are multiplied at a time.
@@ -186,10 +187,53 @@ def fast(loop: Callable) -> Callable:
 
 
 def add_to_band(fused: bool, *arguments: Array | int) -> int:
-    """`to_band`, compiled if `fused`."""
-    return (fast(to_band) if fused else to_band)(*arguments)
+    """`to_band`, compiled if `fused`, else on whole arrays."""
+    return (fast(to_band) if fused else _to_band)(*arguments)
 
 
 def add_to_blocks(fused: bool, *arguments: Array | int) -> None:
-    """`to_blocks`, compiled if `fused`."""
-    (fast(to_blocks) if fused else to_blocks)(*arguments)
+    """`to_blocks`, compiled if `fused`, else on whole arrays."""
+    (fast(to_blocks) if fused else _to_blocks)(*arguments)
+
+
+# ---------------------------------------------------------------------- the reference
+
+
+def _grams(rows, starts, bases, chain, order, size):
+    """The Gram matrices (runs, W, W) of all runs, in control points."""
+    grams = np.add.reduceat(np.einsum("nra,nrb->nab", rows, rows), starts[:-1])
+    local = np.broadcast_to(np.eye(grams.shape[1]), grams.shape).copy()
+    for s in range(bases.shape[1]):
+        for j in range(1, order):
+            here, before = ((s * order + i) * size for i in (j, j - 1))
+            pair = chain[bases[:, s] + j - 1]
+            local[:, here : here + size, before : before + size] = pair[:, 0]
+            local[:, here : here + size, here : here + size] = pair[:, 1]
+    return local.transpose(0, 2, 1) @ grams @ local
+
+
+def _to_band(rows, starts, bases, chain, order, size, columns, band, border, corner, right):
+    if len(rows) == 0:
+        return 0
+    grams, n, count = _grams(rows, starts, bases, chain, order, size), len(band), columns.shape[1]
+    there = columns >= 0
+    np.add.at(right, columns[there], grams[:, :-1, -1][there])
+    i, j = np.repeat(columns, count, axis=1).reshape(-1), np.tile(columns, (1, count)).reshape(-1)
+    value = grams[:, :-1, :-1].reshape(-1)
+    keep = (j >= 0) & (j <= i)
+    i, j, value = i[keep], j[keep], value[keep]
+    near = (i < n) & (i - j < band.shape[1])
+    np.add.at(band, (j[near], (i - j)[near]), value[near])
+    mixed, outer = (i >= n) & (j < n), (i >= n) & (j >= n)
+    np.add.at(border, (j[mixed], i[mixed] - n), value[mixed])
+    np.add.at(corner, (i[outer] - n, j[outer] - n), value[outer])
+    return int(((i < n) & ~near & (value != 0.0)).sum())
+
+
+def _to_blocks(rows, starts, bases, chain, order, size, columns, blocks, right):
+    if len(rows) == 0:
+        return
+    grams = _grams(rows, starts, bases, chain, order, size)
+    blocks[:] = grams[:, :-1, :-1]
+    there = columns >= 0
+    np.add.at(right, columns[there], grams[:, :-1, -1][there])

@@ -85,8 +85,9 @@ def emit_rows(
 ) -> str:
     """`name(in0, ..., out0, ..., begin, stop)`: row r of every output from row r of every input, flat arrays.
 
-    The inputs after those of the given sizes are shared by all rows. The last output of the programs is 1 for rows to refuse; how many is returned. A block in which the near program
-    does not hold for some row is done again by the far one.
+    The inputs after those of the given sizes are shared by all rows. The last output of the programs is 1 for rows to
+    refuse; how many is returned. A block in which the near program does not hold for some row is done again by the
+    far one.
     """
     ins = [f"in{i}" for i in range(len(sizes) + len(shared))]
     outs = [f"out{i}" for i in range(len(results))]

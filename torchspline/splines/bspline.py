@@ -8,10 +8,11 @@ from torch import Tensor, nn
 
 from torchspline import checks
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
-from torchspline.groups.group import R3, SO3, Group, product
+from torchspline.groups.group import R3, SO3, Group, Side, product
 from torchspline.kernels.mode import usable
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, check_float32, locate
 from torchspline.splines.fused import fused_bspline, kernels_of
+from torchspline.splines.jacobians import Jacobians, bspline_jacobians
 from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
 
@@ -59,10 +60,7 @@ def bspline(
     """
     group = _as_group(group)
     _check_control_points(control_points, group, order)
-    if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
-        raise ValueError(
-            f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
-        )
+    _check_derivatives(derivatives)
     checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
     start, spacing = _knots(t, dt, t0, dt_ns, t0_ns)
     _check_times(t, control_points)
@@ -100,6 +98,13 @@ def bspline(
                 checks.finite("t", t)
         fields = reference(control_points, times, start, spacing)
     return State(*(_shaped(field, shape) for field in fields))
+
+
+def _check_derivatives(derivatives: int) -> None:
+    if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
+        raise ValueError(
+            f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
+        )
 
 
 def _shaped(field: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -325,6 +330,44 @@ class BSpline(Trajectory):
             extrapolate=self.extrapolate,
             validate=self.validate,
         )
+
+    def jacobians(self, t: Tensor, derivatives: int = 2, side: Side = "left") -> Jacobians:
+        """Jacobians of the state with respect to each active control point and to time, [S20] Theorems 5.4-5.6.
+
+        On R^1 with k = 4, in the middle of a segment, `value[0, :, 0, 0]` is the B-spline's weights
+        `[1, 23, 23, 1] / 48`, and `velocity[0, :, 0, 0]` is `[-1, -5, 5, 1] / (8 dt)`. On SO3 with all control points
+        equal, each of these numbers stands times the 3 x 3 identity.
+
+        Args:
+            t: as for `evaluate`, inside the domain. derivatives: 0 to 3.
+            side: "left", [S20] (11), or "right": where the perturbation of control points stands, see `Jacobians`.
+        Returns:
+            Jacobians: for each derivative `(*batch, N, k, D, D)`, and `first`, `(*batch, N)`. A scalar time drops N.
+            Plain numbers on the CPU, without a graph.
+        Raises:
+            TypeError, ValueError: as `evaluate`; also for control points that are not on the CPU.
+        """
+        _check_derivatives(derivatives)
+        checks.choice("side", side, ("left", "right"))
+        start, spacing = _knots(t, self.dt, 0.0 if self.t0 is None else self.t0, self.dt_ns, self.t0_ns)
+        _check_times(t, self.control_points)
+        if self.control_points.device.type != "cpu":
+            raise ValueError(
+                f"control_points: expected them on the CPU, got {self.control_points.device}; "
+                "use .to('cpu').jacobians(...)"
+            )
+        _check_values(self.control_points, self.group)
+        with torch.no_grad():
+            points, times, shape = _align(self.control_points, t)
+            if times.dtype != torch.int64:
+                checks.finite("t", times)
+            place = locate(times, start, spacing, points.shape[-2] - self.order + 1, "error", True)
+            seconds = spacing * _NANOSECOND if times.dtype == torch.int64 else spacing
+            result = bspline_jacobians(
+                points, place.segment, place.u, self.group, self.order, float(seconds), derivatives, side
+            )
+        rank = len(points.shape[:-2]) + 1
+        return Jacobians(*(None if x is None else x.reshape((*shape, *x.shape[rank:])) for x in result))  # type: ignore[arg-type]
 
     def extra_repr(self) -> str:
         unit = "s" if self.dt_ns is None else "ns"

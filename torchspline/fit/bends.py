@@ -1,0 +1,65 @@
+"""Regularisation of a trajectory's own control points: differences of the logarithms of neighbours."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchspline.fit.model import Model, State
+from torchspline.fit.system import Rows, System
+from torchspline.fit.terms import CHUNK
+
+Array = NDArray[Any]
+
+
+class Bends:
+    """`weight (d_{j+1} - d_j)` of all neighbouring logarithms d, or `weight d_j` if there are but two control points.
+
+    Bridges stretches without data: there the logarithms run from one value to the other at a steady pace.
+
+    Args:
+        weight: (D,), of each component.
+    """
+
+    def __init__(self, model: Model, weight: Array):
+        spline = model.trajectory
+        self.weight = weight
+        self.span = min(3, spline.count)
+        first = np.arange(spline.count - self.span + 1)
+        own = model.columns[id(spline.module)]
+        self.columns = own[first[:, None] + np.arange(self.span)].reshape(len(first), -1)
+        self.bases = np.ascontiguousarray(first[:, None].astype(np.int64))
+
+    def __len__(self) -> int:
+        return len(self.bases)
+
+    def touched(self, state: State) -> Array:
+        """Columns of the unknowns of each run."""
+        return self.columns
+
+    def add_to(self, system: System, state: State) -> None:
+        """Add cost and normal equations."""
+        assert state.chain is not None
+        for cost, rows, _ in self.linearize(state):
+            system.cost += cost
+            system.add(rows, state.chain)
+
+    def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
+        """Cost, rows and residuals, chunk by chunk."""
+        assert state.local is not None
+        D = len(self.weight)
+        for begin in range(0, len(self), CHUNK):
+            stop = min(begin + CHUNK, len(self))
+            logs = state.local.logs
+            bend = logs[begin + 1 : stop + 1] - logs[begin:stop] if self.span == 3 else logs[begin:stop]
+            residual = self.weight * bend
+            rows = np.zeros((stop - begin, D, self.span * D + 1))
+            each = np.arange(D)
+            rows[:, each, (self.span - 1) * D + each] = self.weight
+            if self.span == 3:
+                rows[:, each, D + each] = -self.weight
+            rows[..., -1] = residual
+            starts = np.arange(stop - begin + 1, dtype=np.int64)
+            part = Rows(rows, starts, self.bases[begin:stop], self.columns[begin:stop], self.span)
+            yield 0.5 * float(np.square(residual).sum()), part, residual

@@ -1,0 +1,238 @@
+"""Knots for a fit: a uniform grid over the measurements, and how wide it should be."""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchspline.fit.banded import FloatArray, difference_band, gram_band, solve_band, transpose_apply
+from torchspline.splines.basis import blending_matrix, derivative_matrix
+from torchspline.splines.clock import locate
+
+_NANOSECONDS = 1_000_000_000
+#: Neighbouring spacings that are compared differ by this factor.
+_RATIO = 2**0.5
+#: Fewest poses a knot interval that are tried, and knot intervals.
+_LEAST_POSES, _LEAST_INTERVALS = 1.5, 6
+#: How often worse than the best so far ends the search.
+_GIVE_UP = 5.0
+#: The fits agree best about here, but the acceleration of the narrower one is nearer to the truth: in what it misses
+#: the wider one is off by a multiple. Found on recordings with an IMU beside the poses.
+_NARROWER = 0.7
+
+
+class Knots:
+    """Uniform knots over a stretch of time, in the unit of the times."""
+
+    def __init__(self, times: Tensor, dt: float, order: int):
+        self.order = order
+        self.nanoseconds = times.dtype == torch.int64
+        self.t0 = times[0].item()
+        self.dt: float | int = round(dt * _NANOSECONDS) if self.nanoseconds else float(dt)
+        if self.dt == 0:
+            raise ValueError(f"dt: with int64 times expected at least a nanosecond, got {dt} s")
+        span = times[-1].item() - self.t0
+        if self.nanoseconds:
+            segments = -(-span // self.dt)
+        else:  # rounding errors of the times beyond the last knot belong to the domain, see `locate`
+            rounding = np.finfo(np.float64).eps * (abs(times[-1].item()) + abs(self.t0) + span) / self.dt
+            segments = math.ceil(span / self.dt - min(3.0 * rounding, 1e-3))
+        self.segments = max(int(segments), 1)
+        self.count = self.segments + order - 1
+        if self.count > 1_000_000 and self.count > 1000 * len(times):
+            raise ValueError(
+                f"dt: {dt} s makes {self.count} control points for {len(times)} poses; use a larger one"
+            )
+
+    def options(self) -> dict[str, Any]:
+        return {"dt_ns": self.dt, "t0_ns": self.t0} if self.nanoseconds else {"dt": self.dt, "t0": self.t0}
+
+    def place(self, times: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        located = locate(times, self.t0, self.dt, self.segments, "error", True)
+        return located.segment.numpy(), located.u.numpy()
+
+    def gaps(self, times: Tensor) -> list[tuple[float, float]]:
+        """Stretches between neighbouring poses longer than two knot intervals."""
+        steps = times.diff()
+        wide = torch.nonzero(steps > 2 * self.dt).flatten().tolist()
+        return [(times[i].item(), times[i + 1].item()) for i in wide]
+
+    @property
+    def seconds(self) -> float:
+        """The spacing."""
+        return self.dt * (1e-9 if self.nanoseconds else 1.0)
+
+    def _basis(self, first: np.ndarray, u: FloatArray, derivative: int) -> FloatArray:
+        """Weights (N, k) of the control points, for splines in R^n; derivatives per second."""
+        matrix = np.array(derivative_matrix(blending_matrix(self.order), derivative), dtype=np.float64)
+        weights = u[:, None] ** np.arange(self.order) @ matrix.T
+        return weights / self.seconds**derivative
+
+    def _place_at(self, s: Tensor) -> tuple[np.ndarray, FloatArray]:
+        """The same as `place` for times in knot spacings since the start."""
+        first = s.floor().clamp(0, self.segments - 1)
+        return first.to(torch.int64).numpy(), (s - first).numpy()
+
+    def linear_fit(self, times: Tensor, values: FloatArray, smoothness: float) -> FloatArray:
+        """Control points (M, C) of the least-squares spline in R^C through `values` (N, C).
+
+        Args:
+            smoothness: weight of squared second differences of control points.
+        """
+        return self._linear_fit(*self.place(times), values, smoothness)
+
+    def linear_fit_at(self, s: Tensor, values: FloatArray) -> FloatArray:
+        """The same without smoothing, times in knot spacings since the start."""
+        return self._linear_fit(*self._place_at(s), values, 0.0)
+
+    def _linear_fit(
+        self, first: np.ndarray, u: FloatArray, values: FloatArray, smoothness: float
+    ) -> FloatArray:
+        weights = self._basis(first, u, 0)
+        difference = min(2, self.count - 1)
+        band = smoothness * difference_band(self.count, difference, max(self.order, difference + 1))
+        band[: self.order] += gram_band(weights, first, self.count)
+        band[0] += 1e-14 * len(u) / self.segments  # keeps a single knot interval with few poses definite
+        return solve_band(band, transpose_apply(weights, first, self.count, values))
+
+    def evaluate(self, control_points: FloatArray, times: Tensor, derivative: int = 0) -> FloatArray:
+        """The spline in R^C, or a derivative of it, at times (N, C)."""
+        return self._evaluate(control_points, *self.place(times), derivative)
+
+    def evaluate_at(self, control_points: FloatArray, s: Tensor) -> FloatArray:
+        """The same, times in knot spacings since the start."""
+        return self._evaluate(control_points, *self._place_at(s), 0)
+
+    def _evaluate(
+        self, control_points: FloatArray, first: np.ndarray, u: FloatArray, derivative: int
+    ) -> FloatArray:
+        windows = control_points[first[:, None] + np.arange(self.order)]
+        return np.einsum("nk,nkc->nc", self._basis(first, u, derivative), windows)
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Knot spacings, s, and why."""
+
+    rotation: float
+    position: float
+    reason: str
+
+
+def choose_spacing(
+    times: Tensor, measured: Tensor, order: int, smoothness: float, accuracy: tuple[float, float] | None
+) -> Spacing:
+    """Spacings that suit the data, from banded linear fits of the stored numbers at many spacings.
+
+    A spline with knots too near follows the noise, one with knots too far misses motion; both show as a difference
+    between the fits at two neighbouring spacings, one falling with the spacing and one rising. Where the sum is least,
+    the error of a fit is about least, too [Lepski 1991]. Compared is what an IMU would see: rates of rotation, and
+    accelerations. Nothing has to be known about the noise.
+
+    Args:
+        times: (N,) in order. measured: (N, 7) of continuous sign.
+        accuracy: instead, the root mean square misses in m and rad, per axis, that the widest spacing may have.
+    """
+    unit = 1e-9 if times.dtype == torch.int64 else 1.0
+    numbers = measured.numpy() * np.array([1.0] * 3 + [2.0] * 4)  # a turn by x moves a quaternion by x / 2
+    steps = times.diff().to(torch.float64)
+    steps = steps[steps > 0] * unit
+    span, narrow = float(steps.sum()), _LEAST_POSES * float(steps.median())
+    widest = max(span / _LEAST_INTERVALS, narrow)
+    tried: list[float] = []
+    misses: list[tuple[float, float]] = []
+    changes: list[tuple[float, float]] = []
+    before: tuple[FloatArray, FloatArray] | None = None
+    spacing = narrow
+    # Ends and the surroundings of gaps, where little holds the curve, do not count.
+    inside = _well_inside(times, unit, narrow)
+    while spacing <= widest * (1 + 1e-9):
+        knots = Knots(times, spacing, order)
+        points = knots.linear_fit(times, numbers, smoothness * len(times) / knots.segments)
+        residual = knots.evaluate(points, times) - numbers
+        here = (
+            knots.evaluate(points[:, 3:], times[inside], derivative=1),
+            knots.evaluate(points[:, :3], times[inside], derivative=2),
+        )
+        tried.append(spacing)
+        misses.append((_per_axis(residual[:, :3]), _per_axis(residual[:, 3:])))
+        if before is not None:
+            changes.append((_per_axis(here[0] - before[0]), _per_axis(here[1] - before[1])))
+            if accuracy is None and all(
+                now > _GIVE_UP * min(c)
+                for now, c in zip(changes[-1], zip(*changes, strict=True), strict=True)
+            ):
+                break
+        if accuracy is not None and all(
+            now > _GIVE_UP * limit for now, limit in zip(misses[-1], accuracy, strict=True)
+        ):
+            break
+        before, spacing = here, spacing * _RATIO
+    if accuracy is not None:
+        return _widest_within(tried, misses, accuracy)
+    if not changes:
+        return Spacing(
+            tried[0], tried[0], f"too few poses to compare spacings: {tried[0] * 1e3:.3g} ms, the narrowest"
+        )
+    rotation, position = (_least(tried, [c[i] for c in changes]) for i in (0, 1))
+    position *= _NARROWER
+    reason = (
+        f"fits at neighbouring spacings agree best at {rotation * 1e3:.3g} ms in angular velocity (to "
+        f"{min(c[0] for c in changes):.3g} rad/s) and at {position * 1e3:.3g} ms in acceleration (to "
+        f"{min(c[1] for c in changes):.3g} m/s^2)"
+    )
+    return Spacing(rotation, position, reason)
+
+
+def _per_axis(x: FloatArray) -> float:
+    """Root mean square per axis of three."""
+    return math.sqrt(np.square(x).sum() / (3 * max(len(x), 1)))
+
+
+def _well_inside(times: Tensor, unit: float, narrow: float) -> Tensor:
+    seconds = (times - times[0]).to(torch.float64) * unit
+    margin = 4 * narrow
+    edges = torch.cat(
+        [
+            seconds[:1],
+            seconds[1:][seconds.diff() > 4 * narrow],
+            seconds[:-1][seconds.diff() > 4 * narrow],
+            seconds[-1:],
+        ]
+    )
+    edges = edges.sort().values
+    after = torch.searchsorted(edges, seconds).clamp(1, len(edges) - 1)
+    distance = torch.minimum((seconds - edges[after - 1]).abs(), (edges[after] - seconds).abs())
+    inside = distance >= margin
+    return inside if bool(inside.any()) else torch.ones_like(inside)
+
+
+def _least(tried: list[float], changes: list[float]) -> float:
+    """The spacing of least change, between the two that were compared; a parabola through three finds it."""
+    middles = np.log([math.sqrt(a * b) for a, b in pairwise(tried)])
+    heights = np.log(np.maximum(changes, 1e-300))
+    best = int(np.argmin(heights))
+    if 0 < best < len(heights) - 1:
+        a, b, c = heights[best - 1 : best + 2]
+        shift = 0.5 * (a - c) / max(a - 2 * b + c, 1e-12)
+        return float(np.exp(middles[best] + np.clip(shift, -0.5, 0.5) * np.log(_RATIO)))
+    return float(np.exp(middles[best]))
+
+
+def _widest_within(
+    tried: list[float], misses: list[tuple[float, float]], accuracy: tuple[float, float]
+) -> Spacing:
+    chosen = []
+    for i, limit in enumerate(accuracy):
+        fitting = [h for h, miss in zip(tried, misses, strict=True) if miss[i] <= limit]
+        chosen.append(max(fitting) if fitting else tried[0])
+    reached = misses[tried.index(chosen[0])][0], misses[tried.index(chosen[1])][1]
+    reason = (
+        f"widest spacings within {accuracy[0]:g} m and {accuracy[1]:g} rad: {chosen[0] * 1e3:.3g} ms for positions "
+        f"(misses {reached[0]:.3g} m) and {chosen[1] * 1e3:.3g} ms for rotations (misses {reached[1]:.3g} rad)"
+    )
+    return Spacing(chosen[1], chosen[0], reason)

@@ -1,0 +1,91 @@
+"""What is known of unknowns beforehand, or remembered of measurements that were dropped: Gaussians on unknowns."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchspline.fit.model import Model, State
+from torchspline.fit.system import System
+from torchspline.fit.variables import Variable
+from torchspline.splines.bspline import BSpline
+
+Array = NDArray[Any]
+
+
+class Part(NamedTuple):
+    """Of a prior: an unknown, which of its control points (all of a variable), and where they stood, `(C, P)`."""
+
+    unknown: BSpline | Variable
+    points: Array
+    reference: torch.Tensor
+
+
+class Prior:
+    """`1/2 x^T H x + g^T x` of the steps x from reference values, all parts side by side.
+
+    Args:
+        information: H (n, n). slope: g (n,). constant: added to the cost.
+    """
+
+    def __init__(self, parts: list[Part], information: Array, slope: Array, constant: float = 0.0):
+        self.parts, self.information, self.slope, self.constant = parts, information, slope, constant
+
+    def bind(self, model: Model) -> "BoundPrior":
+        """With the unknowns' columns."""
+        return BoundPrior(self, model)
+
+
+class BoundPrior:
+    """A prior on the unknowns of a model."""
+
+    def __init__(self, prior: Prior, model: Model):
+        self.prior = prior
+        self.columns = np.concatenate(
+            [model.columns_of(p.unknown)[p.points].reshape(-1) for p in prior.parts]
+        )
+
+    def touched(self, state: State) -> Array:
+        """Columns of the unknowns, one run."""
+        return self.columns[None]
+
+    def add_to(self, system: System, state: State) -> None:
+        """Add cost and normal equations; the steps' own Jacobians are those of the logarithm."""
+        steps, jacobians = [], []
+        for part in self.prior.parts:
+            step, jacobian = _step(part, state)
+            steps.append(step.reshape(-1))
+            jacobians += list(jacobian)
+        x, J = np.concatenate(steps), _block_diagonal(jacobians)
+        H, g = self.prior.information, self.prior.slope
+        system.cost += 0.5 * float(x @ H @ x) + float(g @ x) + self.prior.constant
+        system.add_dense(self.columns, J.T @ H @ J, J.T @ (H @ x + g))
+
+
+def _step(part: Part, state: State) -> tuple[Array, Array]:
+    """Tangents from the reference to where the unknowns stand (C, D), and their Jacobians (C, D, D)."""
+    unknown, reference = part.unknown, part.reference
+    if isinstance(unknown, BSpline):
+        now = torch.from_numpy(state.points[id(unknown)][part.points])
+        group = unknown.group
+    else:
+        now = state.values[id(unknown)].reshape(-1, unknown.size)[part.points]
+        if unknown.sphere:  # the change of the vector, seen from the basis at the reference
+            at_reference, at_now = unknown.basis(reference), unknown.basis(now)
+            assert at_reference is not None
+            assert at_now is not None
+            back = at_reference.mT / reference.square().sum(-1)[:, None, None]
+            return (back @ (now - reference).unsqueeze(-1)).squeeze(-1).numpy(), (back @ at_now).numpy()
+        if unknown.group is None:
+            size = unknown.dimension
+            return (now - reference).numpy(), np.broadcast_to(np.eye(size), (len(now), size, size))
+        group = unknown.group
+    step = group.log(group.between(reference, now, validate=False), validate=False)
+    return step.numpy(), group.right_jacobian_inverse(step, validate=False).numpy()
+
+
+def _block_diagonal(blocks: list[Array]) -> Array:
+    from scipy.linalg import block_diag
+
+    return block_diag(*blocks)
