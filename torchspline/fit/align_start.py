@@ -124,7 +124,7 @@ def start(trajectory: BSpline, s: Array, gyro: Array, lags: tuple[float, float])
     speeds = tuple(np.minimum(v, 1.5 * np.quantile(v, 0.999)) for v in speeds)
     turning = float(np.std(speeds[0]))
     shorter = min(len(tau), int((there > 0).sum())) * step
-    least = min(2.0, 0.5 * shorter)
+    least = min(10.0, 0.5 * shorter)
     shifts, score = _correlation(speeds[0], speeds[1], (there > 0).astype(float), step, least)
     allowed = (shifts * step >= lags[0] - 0.5 * step) & (shifts * step <= lags[1] + 0.5 * step)
     if not (allowed & np.isfinite(score)).any():
@@ -182,7 +182,7 @@ def _correlation(x: Array, y: Array, there: Array, step: float, least: float) ->
     n = np.maximum(sums(fone, fthere), 1.0)
     sx, sy, sxx, syy = sums(fx, fthere), sums(fone, fy), sums(fxx, fthere), sums(fone, fyy)
     vx, vy = sxx - sx * sx / n, syy - sy * sy / n
-    floor = 1e-9 * max(float(np.sum(x * x)), 1e-300), 1e-9 * max(float(np.sum(y * y)), 1e-300)
+    floor = [1e-9 * max(float(np.sum(v * v)), 1e-30) for v in (x, y)]
     r = (sums(fx, fy) - sx * sy / n) / np.sqrt(np.maximum(vx, floor[0]) * np.maximum(vy, floor[1]))
     score = np.arctanh(np.clip(r, -1.0 + 1e-6, 1.0 - 1e-6)) * np.sqrt(n)
     return shifts, np.where(n * step >= least, score, -np.inf)
