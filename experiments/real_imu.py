@@ -223,6 +223,8 @@ def experiment(out: Path, data: str, recordings: list[str], spacings: list[int],
         x.update((spacing, compare(recording, spacing)) for spacing in spacings)
         x["halves"] = halves(recording, x["auto"].spacing)
         found[name] = x
+        a = x["auto"]
+        print(f"{name}: {a.gyro:.4f} rad/s, {a.accel:.3f} m/s² in {a.seconds:.1f} s", flush=True)
     show(out, tables(found, spacings))
     save(figure(found, spacings), out / "real_imu.png")
     return {

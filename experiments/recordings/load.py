@@ -68,7 +68,7 @@ def _arrays(data: Path, name: str) -> Recording:
 
 
 def synthetic(seed: int, duration: float = 20.0) -> Recording:
-    """Noisy poses at 120 Hz and readings at 200 Hz of a random motion, the IMU's clock 0.2 s ahead."""
+    """Noisy poses at 120 Hz and readings at 200 Hz of a random motion, the IMU's clock 5 ms ahead."""
     generator = torch.Generator().manual_seed(seed)
     knot, count = 0.3, math.ceil(duration / 0.3) + 5
     position = 0.3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
@@ -87,7 +87,7 @@ def synthetic(seed: int, duration: float = 20.0) -> Recording:
         reading = imu.measure(motion, times)
     noise = torch.randn(len(times), 6, generator=generator, dtype=torch.float64)
     samples = ImuRecord(
-        times + SECOND // 5,
+        times + SECOND // 200,
         reading.gyroscope + 0.01 * noise[:, :3],
         reading.accelerometer + 0.05 * noise[:, 3:],
         "synthetic",
