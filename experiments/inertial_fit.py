@@ -1,8 +1,8 @@
 """A trajectory from inertial readings and sparse poses: what motion capture saw in between is withheld and recovered.
 
-Poses thinned to a few a second hold the trajectory in place; gyroscope and accelerometer, at their full rate, say how it
-moves in between. Unknown besides the control points: biases, the direction of gravity, the offset and rate of the IMU's
-clock. The result is compared with the poses that were left out.
+Poses thinned to a few a second hold the trajectory in place; gyroscope and accelerometer, at their full rate, say how
+it moves in between. Unknown besides the control points: biases, the direction of gravity, the offset and rate of the
+IMU's clock. The result is compared with the poses that were left out.
 """
 
 import math
@@ -38,7 +38,9 @@ class Fitted(NamedTuple):
     seconds: float
 
 
-def fit(recording: Recording, chosen: Tensor, spacing: float, representation: str, bias_spacing: float) -> Fitted:
+def fit(
+    recording: Recording, chosen: Tensor, spacing: float, representation: str, bias_spacing: float
+) -> Fitted:
     """Poses of the rows `chosen` and all readings; a start from the poses alone."""
     began = time.perf_counter()
     stamps, poses = recording.poses.time_ns[chosen], recording.pose[chosen]
@@ -62,7 +64,12 @@ def fit(recording: Recording, chosen: Tensor, spacing: float, representation: st
     problem.add(RESIDUALS["Pose"](stamps, poses, sigma=sigmas))
     problem.add(
         RESIDUALS["Gyroscope"](
-            t, samples.gyroscope[inside], sigma=SIGMAS[2], loss=Huber(3.0), clock=clock, bias=biases["gyro_bias"]
+            t,
+            samples.gyroscope[inside],
+            sigma=SIGMAS[2],
+            loss=Huber(3.0),
+            clock=clock,
+            bias=biases["gyro_bias"],
         )
     )
     problem.add(
@@ -208,4 +215,12 @@ def _figure(t: Tensor, drawn: dict[str, tuple[Tensor, Tensor]], title: str) -> F
 
 
 if __name__ == "__main__":
-    run(experiment, smoke={"recording": "synthetic", "spacing": 0.1, "bias_spacings": [0.0], "representations": ["split"]})
+    run(
+        experiment,
+        smoke={
+            "recording": "synthetic",
+            "spacing": 0.1,
+            "bias_spacings": [0.0],
+            "representations": ["split"],
+        },
+    )

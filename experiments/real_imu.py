@@ -51,7 +51,9 @@ def compare(recording: Recording, spacing: float | str) -> Compared:
     gyro, accel = errors(fit.trajectory, recording, alignment, start, min(stop, start + LONGEST))
     seconds = time.perf_counter() - began
     assert fit.trajectory.dt_ns is not None
-    return Compared(gyro, accel, alignment, fit.trajectory.dt_ns / SECOND, seconds, fit.notes + alignment.notes)
+    return Compared(
+        gyro, accel, alignment, fit.trajectory.dt_ns / SECOND, seconds, fit.notes + alignment.notes
+    )
 
 
 def errors(
@@ -121,7 +123,9 @@ def _kept(recording: Recording, part: torch.Tensor | None) -> tuple[torch.Tensor
     left_out = near_gaps(recording.poses, samples.time_ns)
     if part is not None:
         left_out = left_out | ~part
-    gyro, accel = (x.masked_fill(left_out[:, None], math.nan) for x in (samples.gyroscope, samples.accelerometer))
+    gyro, accel = (
+        x.masked_fill(left_out[:, None], math.nan) for x in (samples.gyroscope, samples.accelerometer)
+    )
     return gyro, accel
 
 
@@ -179,7 +183,8 @@ def figure(found: dict[str, dict[str, Any]], spacings: list[int]) -> Figure:
     for axis, sensor in zip(axes, ("gyro", "accel"), strict=False):
         for column in (*spacings, "auto"):
             scale = [
-                best(n)[sensor == "accel"] if n in YARDSTICK else getattr(found[n]["auto"], sensor) for n in names
+                best(n)[sensor == "accel"] if n in YARDSTICK else getattr(found[n]["auto"], sensor)
+                for n in names
             ]
             ratio = [getattr(found[n][column], sensor) / s for n, s in zip(names, scale, strict=True)]
             auto = column == "auto"

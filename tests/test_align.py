@@ -76,7 +76,9 @@ class Truth:
             "time_offset": torch.tensor([a.time_offset - self.offset - self.skew * away], dtype=F64),
             "clock_skew": torch.tensor([a.clock_skew - self.skew], dtype=F64),
             # A step of the rotation from the IMU to the body, seen in the IMU.
-            "rotation_imu_body": SO3.log(SO3.compose(self.rotation_imu_body, SO3.inverse(a.rotation_imu_body))),
+            "rotation_imu_body": SO3.log(
+                SO3.compose(self.rotation_imu_body, SO3.inverse(a.rotation_imu_body))
+            ),
             "gyro_bias": a.gyro_bias - self.gyro_bias,
         }
         if a.gravity is not None:
@@ -110,7 +112,9 @@ def test_standard_deviations_are_those_of_many_draws():
     scores = []
     for seed in range(30):
         truth = Truth(trajectory, seed, offset=0.2, rate=100.0)
-        scores.append(torch.cat(list(truth.scores(align_imu(trajectory, truth.t, truth.gyro, truth.accel)).values())))
+        scores.append(
+            torch.cat(list(truth.scores(align_imu(trajectory, truth.t, truth.gyro, truth.accel)).values()))
+        )
     spread = torch.stack(scores).square().mean(0).sqrt()
     # 30 draws tell a standard deviation to 13 %; 17 of them stay within three times that.
     assert spread.min() > 0.6
@@ -133,20 +137,27 @@ def test_plain_least_squares_agree_with_a_dense_solution():
     def residual(x):
         x = torch.from_numpy(x)
         q = SO3.retract(q0, x[1:4], side="right")
-        down = SO3.act(SO3.exp(torch.cat([x[4:6], x.new_zeros(1)])), torch.tensor([0.0, 0.0, -1.0], dtype=F64))
+        down = SO3.act(
+            SO3.exp(torch.cat([x[4:6], x.new_zeros(1)])), torch.tensor([0.0, 0.0, -1.0], dtype=F64)
+        )
         turn = SO3.from_matrix(_frame(g0))
         with torch.no_grad():
             made = imu.measure(
                 trajectory, t - x[0], imu_gravity(turn, down), x[6:9], x[9:12], torch.cat([x[12:15], q])
             )
         return torch.cat(
-            [((made.gyroscope - gyro) / a.gyro_rms).flatten(), ((made.accelerometer - accel) / a.accel_rms).flatten()]
+            [
+                ((made.gyroscope - gyro) / a.gyro_rms).flatten(),
+                ((made.accelerometer - accel) / a.accel_rms).flatten(),
+            ]
         ).numpy()
 
     def imu_gravity(turn, down):
         return SO3.act(turn, down) * math.hypot(*imu.STANDARD_GRAVITY)
 
-    start = torch.cat([torch.tensor([a.time_offset, 0, 0, 0, 0, 0], dtype=F64), a.gyro_bias, a.accel_bias, a.lever_arm])
+    start = torch.cat(
+        [torch.tensor([a.time_offset, 0, 0, 0, 0, 0], dtype=F64), a.gyro_bias, a.accel_bias, a.lever_arm]
+    )
     found = least_squares(residual, start.numpy(), x_scale="jac", method="lm")
     moved = torch.from_numpy(found.x) - start
     covariance = torch.linalg.inv(torch.from_numpy(found.jac.T @ found.jac))
@@ -191,7 +202,7 @@ def test_any_unit_and_epoch_of_the_clocks():
         back = 1e-9 * back.to(F64) if trajectory is in_ns else back
         exact = 1e-9 * (expected.pose_time(truth.t) - in_ns.domain[0]).to(F64)
         torch.testing.assert_close(back, exact, rtol=0, atol=1e-6)
-    with pytest.raises(TypeError, match="t: expected torch.float64"):
+    with pytest.raises(TypeError, match=r"t: expected torch\.float64"):
         align_imu(in_s, truth.s, truth.gyro).pose_time(truth.t)
 
 
@@ -322,8 +333,8 @@ def test_clocks_that_never_overlap():
     with pytest.raises(ValueError, match=r"t: expected stamps that overlap .* max_offset = 5 s"):
         align_imu(trajectory, truth.t, truth.gyro, truth.accel)
     assert_within(truth, align_imu(trajectory, truth.t, truth.gyro, truth.accel, max_offset=None))
+    late = torch.cat([truth.t, truth.t[-1:] + 1e7])
     with pytest.raises(ValueError, match="t: expected recordings of less than"):
-        late = torch.cat([truth.t, truth.t[-1:] + 1e7])
         align_imu(trajectory, late, truth.gyro[[*range(len(truth.t)), 0]], max_offset=None)
 
 
@@ -364,10 +375,10 @@ def test_few_readings():
     trajectory = motion(18)
     truth = Truth(trajectory, 18)
     few = slice(0, 20)
-    with pytest.raises(ValueError, match="gyro: expected at least 30 readings .* got 20"):
+    with pytest.raises(ValueError, match=r"gyro: expected at least 30 readings .* got 20"):
         align_imu(trajectory, truth.t[few], truth.gyro[few], truth.accel[few])
     truth.accel[10:] = math.nan
-    with pytest.raises(ValueError, match="accel: expected at least 30 readings .* got 10"):
+    with pytest.raises(ValueError, match=r"accel: expected at least 30 readings .* got 10"):
         align_imu(trajectory, truth.t, truth.gyro, truth.accel)
 
 

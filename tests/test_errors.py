@@ -68,7 +68,7 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit"}
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Alignment"}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
@@ -107,6 +107,7 @@ _QUATERNION = (
 _POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
 _NEW = "Group.identity Group.random"
 _AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_ALIGNED = "Alignment.pose_time"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
 
@@ -116,34 +117,36 @@ NOT_APPLICABLE = {
         "no tensor": f"{_MAKERS} from_scipy {_WINDOWS}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
+        "any shape": _ALIGNED,
     },
     "dtype": {
         "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS}",
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
-        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} consistent_signs phantom_points",
+        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_ALIGNED} consistent_signs "
+        "phantom_points",
         "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
     },
     "nan": {
         "no numbers": f"{_MAKERS} {_NEW} {_WINDOWS} from_scipy",
-        "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
+        "rows with NaN stay as they are": f"{_FILES} {_ALIGNED} PoseRecord ImuRecord",
     },
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
-        "from_scipy read_imu write_imu ImuRecord",
-        "control points and mount were checked when the trajectory was made": _AT_TIMES,
+        f"from_scipy read_imu write_imu ImuRecord {_ALIGNED}",
+        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} align_imu",
         "rows stay as they are until they are used": "PoseRecord",
     },
     "count": {
-        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} measure",
+        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_ALIGNED} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
     },
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
         "SplitBSpline Trajectory.mounted Mounted",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
-        "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
+        "any time, also none at all": f"{_FILES} {_WINDOWS} {_ALIGNED} PoseRecord ImuRecord",
     },
 }
 

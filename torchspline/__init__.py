@@ -1,7 +1,7 @@
 """torchspline: continuous-time motion as a PyTorch layer."""
 
 from torchspline import functional, imu
-from torchspline.fit import PoseFit, fit_poses
+from torchspline.fit import Alignment, PoseFit, align_imu, fit_poses
 from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines import (
@@ -21,6 +21,7 @@ __all__ = [
     "R3",
     "SE3",
     "SO3",
+    "Alignment",
     "BSpline",
     "Group",
     "Kinematics",
@@ -29,6 +30,7 @@ __all__ = [
     "SplitBSpline",
     "State",
     "Trajectory",
+    "align_imu",
     "consistent_signs",
     "convert",
     "fit_poses",

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,36 +11,20 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit import align_start
+from torchspline.fit.align_joint import FEWEST, Joint, Readings, Solution
 from torchspline.fit.losses import GemanMcClure, Loss
 from torchspline.fit.model import NANOSECOND
-from torchspline.fit.problem import Linearizer, Problem
-from torchspline.fit.residual import Clock, Residual, needs
-from torchspline.fit.residuals import RESIDUALS
-from torchspline.fit.variables import Variable
+from torchspline.fit.residual import needs
 from torchspline.groups.group import SO3
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 from torchspline.splines.bspline import BSpline
 
 Array = NDArray[Any]
 _MAGNITUDE = math.hypot(*STANDARD_GRAVITY)
-#: Fewer readings than this are no recording.
-_FEWEST = 30
-#: Solutions, each weighted by the residuals of the one before.
-_ROUNDS = 5
 #: Bins of the correlation of speeds that still fit into memory.
 _MOST_BINS = 20_000_000
 #: The least share of the gyroscope's variance that the trajectory has to explain.
 _EXPLAINED = 0.5
-#: Standard deviations beyond which an estimate counts as not determined: its name, the limit, its unit.
-_LIMITS = {
-    "time_offset": (0.01, "s"),
-    "clock_skew": (0.01, "s/s"),
-    "rotation_imu_body": (0.1, "rad"),
-    "lever_arm": (0.2, "m"),
-    "gyro_bias": (0.05, "rad/s"),
-    "accel_bias": (0.5, "m/s²"),
-    "gravity": (0.5, "m/s²"),
-}
 
 
 @dataclass(frozen=True)
@@ -90,7 +74,9 @@ class Alignment:
         s = (t - first).to(torch.float64) * (NANOSECOND if isinstance(first, int) else 1.0)
         mid = (self.t_mid - origin) * (NANOSECOND if isinstance(origin, int) else 1.0)
         tau = mid + (s - lag - mid) / (1.0 + self.clock_skew)
-        return origin + (tau / NANOSECOND).round().to(torch.int64) if isinstance(origin, int) else origin + tau
+        return (
+            origin + (tau / NANOSECOND).round().to(torch.int64) if isinstance(origin, int) else origin + tau
+        )
 
     @property
     def T_body_imu(self) -> Tensor:
@@ -111,7 +97,7 @@ def align_imu(
     gravity_magnitude: float | None = _MAGNITUDE,
     loss: Loss | None = GemanMcClure(5.0),  # noqa: B008  (never changed)
 ) -> Alignment:
-    """Time offset, clock skew, rotation, lever arm, biases and gravity between a trajectory and an IMU; no start values.
+    """Time offset, clock skew, rotation, lever arm, biases and gravity between a trajectory and an IMU, from scratch.
 
     The lag comes from the correlation of angular speeds, which no rotation changes; the rotation and gyroscope bias at
     the most likely lags from Wahba's problem, the best of which goes on; gravity, accelerometer bias and lever arm from
@@ -145,14 +131,29 @@ def align_imu(
     stamps = _Stamps(t, body)
     sensors = [_clean("gyro", stamps.s, gyro)] + ([] if accel is None else [_clean("accel", stamps.s, accel)])
     start = _start(body, stamps, sensors[0], max_offset, alone=accel is None)
-    return _Joint(body, stamps, sensors, start, estimate_skew, gravity_magnitude, loss).alignment()
+    joint = Joint(body, stamps.epoch, sensors, start, estimate_skew, gravity_magnitude, loss)
+    return _alignment(body, stamps, joint.run())
 
 
-class _Readings(NamedTuple):
-    """Of one sensor, in order of time: `s` (N,) seconds from the first stamp, `x` (N, 3)."""
-
-    s: Array
-    x: Array
+def _alignment(trajectory: BSpline, stamps: "_Stamps", found: Solution) -> Alignment:
+    values, accel = found.values, len(found.used) > 1
+    skew = values.get("clock_skew")
+    return Alignment(
+        time_offset=stamps.epoch + found.lag,
+        clock_skew=0.0 if skew is None else float(skew[0]),
+        t_mid=align_start.times_of(trajectory, np.array([found.mid]))[0].item(),
+        rotation_imu_body=SO3.inverse(values["rotation_imu_body"]),
+        lever_arm=values.get("lever_arm"),
+        gyro_bias=values["gyro_bias"],
+        accel_bias=values.get("accel_bias"),
+        gravity=values.get("gravity"),
+        gyro_rms=found.rms[0],
+        accel_rms=found.rms[1] if accel else None,
+        std={n: float(x[0]) if n in ("time_offset", "clock_skew") else x for n, x in found.std.items()},
+        used=(found.used[0], found.used[1] if accel else 0),
+        notes=found.notes,
+        _clocks=(stamps.first, stamps.origin, found.lag),
+    )
 
 
 class _Stamps:
@@ -161,11 +162,13 @@ class _Stamps:
     def __init__(self, t: Tensor, trajectory: BSpline):
         finite = ~t.isnan() if t.dtype != torch.int64 else torch.ones_like(t, dtype=torch.bool)
         if not bool(finite.any()):
-            raise ValueError(f"t: expected at least {_FEWEST} stamps, got 0 that are not NaN")
+            raise ValueError(f"t: expected at least {FEWEST} stamps, got 0 that are not NaN")
         t = t.detach().cpu()
         self.first: float | int = t[finite].min().item()
         self.origin = trajectory.domain[0]
-        self.s = (t - self.first).numpy() * NANOSECOND if isinstance(self.first, int) else (t - self.first).numpy()
+        self.s = (
+            (t - self.first).numpy() * NANOSECOND if isinstance(self.first, int) else (t - self.first).numpy()
+        )
         if isinstance(self.first, int) and isinstance(self.origin, int):
             self.epoch = (self.first - self.origin) * NANOSECOND
         else:
@@ -188,7 +191,9 @@ def _check(trajectory: BSpline, t: Tensor, gyro: Tensor, accel: Tensor | None) -
     if device.type != "cpu":
         raise ValueError(f"trajectory: expected one on the CPU, got {device}; move it with .to('cpu')")
     if not isinstance(t, Tensor):
-        raise TypeError(f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor")
+        raise TypeError(
+            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
+        )
     if t.dtype not in (torch.float64, torch.int64):
         raise TypeError(f"t: expected float64 seconds or int64 nanoseconds, got {t.dtype}")
     if t.ndim != 1:
@@ -204,7 +209,9 @@ def _check(trajectory: BSpline, t: Tensor, gyro: Tensor, accel: Tensor | None) -
         if y is None:
             continue
         if y.device.type != "cpu":
-            raise ValueError(f"{name}: on device {y.device}, but the trajectory is on cpu; move it with .to('cpu')")
+            raise ValueError(
+                f"{name}: on device {y.device}, but the trajectory is on cpu; move it with .to('cpu')"
+            )
         if y.dtype != torch.int64:
             checks.finite(name, y.masked_fill(y.isnan(), 0.0))
 
@@ -221,30 +228,30 @@ def _held(trajectory: BSpline) -> BSpline:
     return BSpline(points, group=trajectory.group, order=trajectory.order, learnable=False, **times)
 
 
-def _clean(name: str, s: Array, x: Tensor) -> _Readings:
+def _clean(name: str, s: Array, x: Tensor) -> Readings:
     values = x.detach().to("cpu", torch.float64).numpy()
     rows = np.flatnonzero(~np.isnan(s) & ~np.isnan(values).any(axis=1))
     rows = rows[np.argsort(s[rows], kind="stable")]
-    if len(np.unique(s[rows])) < _FEWEST:
+    if len(np.unique(s[rows])) < FEWEST:
         raise ValueError(
-            f"{name}: expected at least {_FEWEST} readings at different times without NaN, "
+            f"{name}: expected at least {FEWEST} readings at different times without NaN, "
             f"got {len(np.unique(s[rows]))}"
         )
-    return _Readings(s[rows], values[rows])
+    return Readings(s[rows], values[rows])
 
 
 # ---------------------------------------------------------------------- a start from nothing
 
 
 def _start(
-    trajectory: BSpline, stamps: _Stamps, gyro: _Readings, max_offset: float | None, alone: bool
+    trajectory: BSpline, stamps: _Stamps, gyro: Readings, max_offset: float | None, alone: bool
 ) -> align_start.Start:
     length = align_start.length_of(trajectory)
     lags = (-length, float(gyro.s[-1]))
     if max_offset is not None:
         lags = max(lags[0], -max_offset - stamps.epoch), min(lags[1], max_offset - stamps.epoch)
         near = (gyro.s >= lags[0]) & (gyro.s <= length + lags[1])
-        gyro = _Readings(gyro.s[near], gyro.x[near])
+        gyro = Readings(gyro.s[near], gyro.x[near])
     spans = (
         f"the trajectory lasts {length:.6g} s, the stamps {stamps.s[~np.isnan(stamps.s)].max():.6g} s and begin "
         f"{stamps.epoch:.6g} s after it"
@@ -254,10 +261,12 @@ def _start(
         f"t: expected stamps that overlap with the trajectory{reach}, but {spans}; are they the same recording? "
         "max_offset=None allows any distance of the clocks"
     )
-    if len(gyro.s) < _FEWEST or lags[0] > lags[1]:
+    if len(gyro.s) < FEWEST or lags[0] > lags[1]:
         raise apart
     if (gyro.s[-1] - gyro.s[0] + length) / align_start.STEP > _MOST_BINS:
-        raise ValueError(f"t: expected recordings of less than {_MOST_BINS * align_start.STEP:g} s, but {spans}")
+        raise ValueError(
+            f"t: expected recordings of less than {_MOST_BINS * align_start.STEP:g} s, but {spans}"
+        )
     found = align_start.start(trajectory, gyro.s, gyro.x, lags)
     if found is None:
         raise apart
@@ -266,237 +275,16 @@ def _start(
             f"trajectory: its angular speed varies by {found.turning:.2g} rad/s only: with so little turning neither "
             "time offset nor rotation can be found"
         )
-    if found.open_angle > 0.2 and alone:
-        axis = ", ".join(f"{x:.2f}" for x in found.open_axis)
-        raise ValueError(
-            f"gyro: the motion turns about one axis, [{axis}] in the IMU, which leaves the rotation about it open; "
-            "pass accel as well"
-        )
     if found.explained < _EXPLAINED:
         raise ValueError(
             f"gyro: expected readings of the trajectory's motion, but at the best lag of "
             f"{found.lag + stamps.epoch:.4g} s it explains {max(found.explained, 0.0):.0%} of their variance; is this "
             f"the same recording, is max_offset large enough, are the readings in rad/s? Here {spans}"
         )
-    return found
-
-
-# ---------------------------------------------------------------------- all unknowns together
-
-
-class _Joint:
-    """The least-squares problem of all unknowns, and what follows from its solution."""
-
-    def __init__(
-        self,
-        trajectory: BSpline,
-        stamps: _Stamps,
-        sensors: list[_Readings],
-        start: align_start.Start,
-        skew: bool,
-        magnitude: float | None,
-        loss: Loss | None,
-    ):
-        self.trajectory, self.stamps, self.start, self.loss = trajectory, stamps, start, loss
-        length = align_start.length_of(trajectory)
-        # A spline knows least at its ends, and the offset is still to move.
-        margin = min(max(2.0 * float(np.median(np.diff(sensors[0].s))), 0.05), 0.1 * length)
-        self.used = [_Readings(*(v[_inside(r.s - start.lag, margin, length)] for v in r)) for r in sensors]
-        for name, readings in zip(("gyro", "accel"), self.used, strict=False):
-            if len(readings.s) < _FEWEST:
-                raise ValueError(
-                    f"{name}: expected at least {_FEWEST} readings within the trajectory's domain, "
-                    f"got {len(readings.s)} at a time offset of {start.lag + stamps.epoch:.4g} s"
-                )
-        self.mid = 0.5 * float(self.used[0].s[0] + self.used[0].s[-1]) - start.lag
-        self.offset = Variable("time_offset", torch.zeros(1, dtype=torch.float64))
-        self.skew = Variable("clock_skew", torch.zeros(1, dtype=torch.float64)) if skew else None
-        self.arguments = self._arguments(magnitude)
-        self.notes: list[str] = []
-
-    def _arguments(self, magnitude: float | None) -> list[dict[str, Variable]]:
-        """Of the residual of each sensor, at their start values."""
-        R, bias = self.start.rotation, self.start.bias
-        tau = self.used[0].s - self.start.lag
-        error = self.used[0].x - align_start.angular_velocity(self.trajectory, tau) @ R.T - bias
-        self.sigmas = [_spread(error, None if self.loss is None else 1.0)]
-        more: dict[str, Variable] = {}
-        if len(self.used) > 1:
-            moves = align_start.motion(self.trajectory, self.used[1].s - self.start.lag)
-            force = align_start.force(self.start, moves, self.used[1].x, magnitude)
-            R = force.rotation
-            self.sigmas.append(max(force.scale, 1e-9))
-            sphere = magnitude is not None
-            more = {
-                "bias": _variable("accel_bias", force.bias),
-                "gravity": _variable("gravity", force.gravity, sphere=sphere),
-                "lever_arm": _variable("lever_arm", force.lever_arm),
-            }
-        q = SO3.from_matrix(torch.from_numpy(np.ascontiguousarray(R.T)))
-        rotation = Variable("rotation_imu_body", q, group=SO3)
-        both = [{"bias": _variable("gyro_bias", bias), "rotation": rotation}]
-        return both + ([{**more, "rotation": rotation}] if more else [])
-
-    def problem(self) -> Problem:
-        problem = Problem(self.trajectory)
-        mid = align_start.times_of(self.trajectory, np.array([self.mid]))[0].item()
-        clock = Clock(offset=self.offset, skew=self.skew, mid=mid)
-        kinds = RESIDUALS["Gyroscope"], RESIDUALS["Accelerometer"]
-        for kind, readings, sigma, arguments in zip(kinds, self.used, self.sigmas, self.arguments, strict=False):
-            t = align_start.times_of(self.trajectory, readings.s - self.start.lag)
-            residual: Residual = kind(
-                t, torch.from_numpy(readings.x), sigma=sigma, loss=self.loss, clock=clock, **arguments
-            )
-            problem.add(residual)
-        problem.freeze(problem.trajectory)
-        return problem
-
-    def solve(self) -> Problem:
-        """At the minimum, with each sensor weighted by its own residuals."""
-        for _ in range(_ROUNDS):
-            problem = self.problem()
-            result = problem.solve()
-            before, self.sigmas = self.sigmas, [_spread(r, self.loss and 1.0) for r in self.residuals(problem)]
-            if np.allclose(before, self.sigmas, rtol=2e-3):
-                break
-        if not result.converged:
-            self.notes.append(f"the joint refinement did not converge: {result.reason}")
-        return self.problem()
-
-    def residuals(self, problem: Problem) -> list[Array]:
-        linearizer = problem.prepare()
-        state = linearizer.model.state()
-        return [np.concatenate([r for _, _, r in term.linearize(state)]) for term in linearizer.terms]
-
-    def alignment(self) -> Alignment:
-        with torch.no_grad():
-            problem = self.solve()
-            errors = self.residuals(problem)
-            covariances = _covariances(problem)
-        offset = float(self.offset.value[0])
-        std = {name: _deviations(problem.variables[name], c) for name, c in covariances.items()}
-        values = {name: v.value for name, v in problem.variables.items()}
-        lag = self.start.lag + offset
-        self._note(std, offset, errors)
-        rms = [math.sqrt(float(np.mean(e**2))) for e in errors]
-        return Alignment(
-            time_offset=self.stamps.epoch + lag,
-            clock_skew=0.0 if self.skew is None else float(self.skew.value[0]),
-            t_mid=align_start.times_of(self.trajectory, np.array([self.mid]))[0].item(),
-            rotation_imu_body=SO3.inverse(values["rotation_imu_body"]),
-            lever_arm=values.get("lever_arm"),
-            gyro_bias=values["gyro_bias"],
-            accel_bias=values.get("accel_bias"),
-            gravity=values.get("gravity"),
-            gyro_rms=rms[0],
-            accel_rms=rms[1] if len(rms) > 1 else None,
-            std={n: x if n not in ("time_offset", "clock_skew") else float(x[0]) for n, x in std.items()},
-            used=(len(self.used[0].s), len(self.used[1].s) if len(self.used) > 1 else 0),
-            notes=self.notes,
-            _clocks=(self.stamps.first, self.stamps.origin, lag),
+    if found.open_angle > 0.2 and alone:
+        axis = ", ".join(f"{x:.2f}" for x in found.open_axis)
+        raise ValueError(
+            f"gyro: the motion turns about one axis, [{axis}] in the IMU, which leaves the rotation about it open; "
+            "pass accel as well"
         )
-
-    def _note(self, std: dict[str, Tensor], offset: float, errors: list[Array]) -> None:
-        for name, x in std.items():
-            limit, unit = _LIMITS[name]
-            worst = float(x.max())
-            if not worst <= limit:
-                self.notes.append(f"{name}: the motion hardly tells it, standard deviation {worst:.2g} {unit}")
-        if abs(offset) > 0.1:
-            self.notes.append(
-                f"time_offset: refinement moved it by {offset:.3g} s from the best correlation; check it on another part"
-            )
-        rival, best = self.start.rival, self.start.explained
-        if rival is not None and 1.0 - rival[1] < 1.25 * (1.0 - best):
-            self.notes.append(
-                f"time_offset: {self.stamps.epoch + rival[0]:.4g} s explains the gyroscope almost as well "
-                f"({rival[1]:.1%} of its variance, the one chosen {best:.1%}): the motion repeats itself"
-            )
-        for name, error, sigma in zip(("gyro", "accel"), errors, self.sigmas, strict=False):
-            share = float(np.mean(np.linalg.norm(error, axis=1) > 6.0 * sigma))
-            if share > 0.01:
-                self.notes.append(
-                    f"{name}: {share:.1%} of the readings lie more than 6 standard deviations off; they hardly count"
-                    if self.loss is not None
-                    else f"{name}: {share:.1%} of the readings lie more than 6 standard deviations off"
-                )
-
-
-def _inside(tau: Array, margin: float, length: float) -> Array:
-    return (tau >= margin) & (tau <= length - margin)
-
-
-def _variable(name: str, value: Array, sphere: bool = False) -> Variable:
-    return Variable(name, torch.from_numpy(np.ascontiguousarray(value)), sphere=sphere)
-
-
-def _spread(error: Array, robust: float | None) -> float:
-    """Standard deviation of a component: from the median of lengths, or the root mean square."""
-    if robust is None:
-        return max(math.sqrt(float(np.mean(error**2))), 1e-9)
-    return max(float(np.median(np.linalg.norm(error, axis=1))) / align_start.MEDIAN_LENGTH, 1e-9)
-
-
-def _covariances(problem: Problem) -> dict[str, Array]:
-    """Of the tangent of each variable, robust losses taken into account; infinite where nothing is known.
-
-    An M-estimate has the covariance `A^-1 B A^-1`, with A the mean curvature of the cost and B that of the squares of
-    its gradient [Huber 1981, 7.6]; with weights of one, (J^T J)^-1 times the variance of the residuals. The errors of
-    a sensor are taken as alike on its axes and independent in time.
-    """
-    linearizer: Linearizer = problem.prepare()
-    model = linearizer.model
-    curvature = np.zeros((model.total, model.total))
-    squares = np.zeros_like(curvature)
-    state = model.state()
-    for term in linearizer.terms:
-        plain, total, s = np.zeros_like(curvature), 0, []
-        sigma = term.residual.weighting[1]
-        scale = 1.0 if sigma is None else float(sigma)
-        for _, rows, error in term.linearize(state):
-            width = rows.columns.shape[1]
-            chosen = np.flatnonzero(rows.columns[0] >= 0)
-            jacobian = rows.rows[..., :width][..., chosen].reshape(-1, len(chosen))
-            columns = rows.columns[0, chosen]
-            plain[np.ix_(columns, columns)] += jacobian.T @ jacobian
-            total += len(error)
-            s.append((error**2).sum(axis=1) / scale**2)
-        lengths = torch.from_numpy(np.concatenate(s))
-        weight, bend = torch.ones_like(lengths), torch.zeros_like(lengths)
-        if (loss := term.residual.loss) is not None:
-            with torch.enable_grad():
-                leaf = lengths.clone().requires_grad_()
-                weight = loss.weight(leaf)
-                (bend,) = torch.autograd.grad(weight.sum(), leaf)
-            weight = weight.detach()
-        # Rows carry the roots of the weights: divided by their mean they are those of plain least squares.
-        plain /= max(float(weight.mean()), 1e-12)
-        curvature += plain * float((weight + 2.0 / 3.0 * bend * lengths).mean())
-        squares += plain * float((weight**2 * lengths).mean()) / 3.0
-    inverse, unknown = _pseudo_inverse(curvature)
-    covariance = inverse @ squares @ inverse
-    covariance[np.diag_indices_from(covariance)] = np.where(unknown, np.inf, np.diagonal(covariance))
-    return {
-        v.name: covariance[np.ix_(c, c)]
-        for v in problem.variables.values()
-        for c in [model.columns[id(v)].reshape(-1)]
-    }
-
-
-def _pseudo_inverse(matrix: Array) -> tuple[Array, Array]:
-    """Of a positive semidefinite matrix, and which unknowns have a share in its null space."""
-    scale = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    good = values > 1e-12
-    unknown = (vectors[:, ~good] ** 2).sum(axis=1) > 1e-6
-    inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T
-    return inverse / np.outer(scale, scale), unknown
-
-
-def _deviations(variable: Variable, covariance: Array) -> Tensor:
-    basis = variable.basis(variable.value)
-    if basis is not None and np.isfinite(covariance).all():
-        covariance = basis[0].numpy() @ covariance @ basis[0].numpy().T
-    elif basis is not None:
-        return torch.full((3,), math.inf, dtype=torch.float64)
-    return torch.from_numpy(np.sqrt(np.diagonal(covariance)))
+    return found

@@ -260,7 +260,9 @@ def force(start: Start, body: Motion, accel: Array, magnitude: float | None) -> 
         return _linear(start.rotation, body, accel, magnitude)
     turns = np.arange(_TURNS) * (2 * math.pi / _TURNS)
     vectors = torch.from_numpy(turns[:, None] * start.open_axis)
-    tried = [_linear(R.numpy() @ start.rotation, body, accel, magnitude) for R in SO3.to_matrix(SO3.exp(vectors))]
+    tried = [
+        _linear(R.numpy() @ start.rotation, body, accel, magnitude) for R in SO3.to_matrix(SO3.exp(vectors))
+    ]
     return min(tried, key=lambda x: x.scale)
 
 
@@ -271,7 +273,8 @@ def _linear(rotation: Array, body: Motion, accel: Array, magnitude: float | None
     outer = w[:, :, None] * w[:, None, :]
     arm = _hat(w_dot) + outer - (w * w).sum(1)[:, None, None] * eye
     columns = np.concatenate(
-        [rotation @ arm, -rotation @ body.rotation.transpose(0, 2, 1), np.broadcast_to(eye, (N, 3, 3))], axis=2
+        [rotation @ arm, -rotation @ body.rotation.transpose(0, 2, 1), np.broadcast_to(eye, (N, 3, 3))],
+        axis=2,
     )
     right = accel - body.a @ rotation.T
     weight, scale = np.ones(N), 1.0
