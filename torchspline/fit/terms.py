@@ -30,7 +30,7 @@ class Places(NamedTuple):
     own_u: dict[str, Array]
     outside: Array
     starts: Array
-    #: (runs, moments) and (runs, columns of the rows).
+    #: (runs, moments), or (runs, 0) for a trajectory that stays, and (runs, columns of the rows).
     bases: Array
     columns: Array
     #: Trajectory times (moments, N) and how they move with each unknown of the clock.
@@ -75,6 +75,8 @@ class Term:
             for slot in self.kernel.order
             if isinstance(x := residual.arguments[slot], Variable) and id(x) in model.columns
         ]
+        #: Whether the whole trajectory stays.
+        self.held = not bool((model.columns[id(model.trajectory.module)] >= 0).any())
         self._places: Places | None = None
 
     def __len__(self) -> int:
@@ -110,9 +112,11 @@ class Term:
         keys += self.index.values()
         starts = _runs(keys, len(self))
         first = starts[:-1]
+        # A trajectory that stays as it is has no part in the equations.
+        moving = [] if self.held else base
         columns = [
             self.model.columns[id(trajectory.module)][b[first, None] + np.arange(trajectory.order)]
-            for b in base
+            for b in moving
         ]
         for slot, spline in self.splines.items():
             windows = own_base[slot][first, None] + np.arange(spline.order)
@@ -124,7 +128,7 @@ class Term:
         columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
-            np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
+            np.array([b[first] for b in moving], np.int64).reshape(-1, len(first)).T.copy(),
             np.ascontiguousarray(np.concatenate([c.reshape(len(first), -1) for c in columns], axis=1)),
             rates,
         )  # fmt: skip
@@ -201,6 +205,8 @@ class Term:
         rows[..., -1] = error
         at = 0
         for g, b, x, parts in zip(moments, base, u, kernel.parts, strict=True):
+            if self.held:
+                break
             spline.local.rows(local, b, x, _apply(weight, g), parts, rows, at)
             at += spline.local.width
         for slot, own in self.splines.items():
