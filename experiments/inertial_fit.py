@@ -61,7 +61,7 @@ def fit(
     }
     sigmas = torch.tensor([SIGMAS[0]] * 3 + [SIGMAS[1]] * 3, dtype=torch.float64)
     problem = Problem(trajectory)
-    problem.add(RESIDUALS["Pose"](stamps, poses, sigma=sigmas))
+    problem.add(RESIDUALS["Pose"](stamps, poses, sigma=sigmas, loss=Huber(3.0)))
     problem.add(
         RESIDUALS["Gyroscope"](
             t,
@@ -202,15 +202,18 @@ def experiment(
 def _figure(t: Tensor, drawn: dict[str, tuple[Tensor, Tensor]], title: str) -> Figure:
     figure = Figure(figsize=(10, 6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
-    for name, (position, angle) in drawn.items():
-        upper.plot(t, 1e3 * position, ".", markersize=1.5, label=name)
-        lower.plot(t, angle.rad2deg(), ".", markersize=1.5, label=name)
+    second = t.floor().to(torch.int64)
+    for i, (name, (position, angle)) in enumerate(drawn.items()):
+        for axis, x in ((upper, 1e3 * position), (lower, angle.rad2deg())):
+            axis.plot(t, x, ".", color=f"C{i}", markersize=1, alpha=0.15)
+            square = torch.bincount(second, x.square()) / torch.bincount(second)
+            axis.step(torch.arange(len(square)), square.sqrt(), where="post", color=f"C{i}", label=name)
     upper.set(ylabel="distance [mm]", title=title)
     lower.set(ylabel="angle [deg]", xlabel="time [s]")
     for axis in (upper, lower):
         axis.set_yscale("log")
         axis.grid(alpha=0.3)
-    upper.legend(markerscale=6)
+    upper.legend(title="RMS of each second", loc="lower right")
     return figure
 
 

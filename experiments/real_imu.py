@@ -38,22 +38,22 @@ class Compared(NamedTuple):
     notes: list[str]
 
 
-def compare(recording: Recording, spacing: float | str) -> Compared:
-    """Fit, align, synthesise and compare within the longest stretch of poses without a gap."""
+def compare(recording: Recording, spacing: float | str, alignment: Alignment | None = None) -> Compared:
+    """Fit, align (unless that is done), synthesise and compare, within the longest stretch of poses without a gap."""
     start, stop = longest_stretch(recording.poses)
-    poses = recording.poses.window(start, stop)
+    poses, samples = recording.poses.window(start, stop), recording.samples
     began = time.perf_counter()
     pose = torch.cat([poses.position, poses.rotation], -1)
     dt = spacing if isinstance(spacing, str) else 1e-3 * spacing
     fit = fit_poses(poses.time_ns, pose, dt=dt, progress=False)
-    samples = recording.samples
-    alignment = align_imu(fit.trajectory, samples.time_ns, samples.gyroscope, samples.accelerometer)
+    notes = list(fit.notes)
+    if alignment is None:
+        alignment = align_imu(fit.trajectory, samples.time_ns, samples.gyroscope, samples.accelerometer)
+        notes += alignment.notes
     gyro, accel = errors(fit.trajectory, recording, alignment, start, min(stop, start + LONGEST))
     seconds = time.perf_counter() - began
     assert fit.trajectory.dt_ns is not None
-    return Compared(
-        gyro, accel, alignment, fit.trajectory.dt_ns / SECOND, seconds, fit.notes + alignment.notes
-    )
+    return Compared(gyro, accel, alignment, fit.trajectory.dt_ns / SECOND, seconds, notes)
 
 
 def errors(
@@ -225,7 +225,7 @@ def experiment(out: Path, data: str, recordings: list[str], spacings: list[int],
     for name in recordings:
         recording = load(ROOT / data, name, seed)
         x: dict[Any, Any] = {"auto": compare(recording, "auto")}
-        x.update((spacing, compare(recording, spacing)) for spacing in spacings)
+        x.update((spacing, compare(recording, spacing, x["auto"].alignment)) for spacing in spacings)
         x["halves"] = halves(recording, x["auto"].spacing)
         found[name] = x
         a = x["auto"]

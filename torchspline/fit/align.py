@@ -24,7 +24,7 @@ _MAGNITUDE = math.hypot(*STANDARD_GRAVITY)
 #: Bins of the correlation of speeds that still fit into memory.
 _MOST_BINS = 20_000_000
 #: The least share of the gyroscope's variance that the trajectory has to explain.
-_EXPLAINED = 0.5
+_EXPLAINED = 0.4
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,8 @@ def _start(
         raise ValueError(
             f"gyro: expected readings of the trajectory's motion, but at the best lag of "
             f"{found.lag + stamps.epoch:.4g} s it explains {max(found.explained, 0.0):.0%} of their variance; is this "
-            f"the same recording, is max_offset large enough, are the readings in rad/s? Here {spans}"
+            "the same recording, is max_offset large enough, do the knots follow the motion, are the readings in "
+            f"rad/s? Here {spans}"
         )
     if found.open_angle > 0.2 and alone:
         axis = ", ".join(f"{x:.2f}" for x in found.open_axis)
