@@ -129,6 +129,7 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "BSpline": (BSpline, {"control_points": POSE, "group": SE3, "dt": 0.1}),
     "SplitBSpline": (SplitBSpline, {"control_points": POSE, "dt": 0.1}),
     "BSpline.evaluate": (SPLINE.evaluate, {"t": T, "derivatives": 2}),
+    "BSpline.jacobians": (SPLINE.jacobians, {"t": T, "derivatives": 2, "side": "left"}),
     "Trajectory.forward": (SPLINE.forward, {"t": T}),
     "Trajectory.kinematics": (SPLINE.kinematics, {"t": T}),
     "Trajectory.mounted": (SPLINE.mounted, {"T_body_sensor": POSE[0, 0]}),

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from types import SimpleNamespace
 
+import error_fit
 import torch
 from error_arguments import (
     ACCEPTED,
@@ -71,6 +72,8 @@ def cases() -> Iterator[Case]:
 
     quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0}
     for function, (_, good) in ACCEPTED.items():
+        if function in error_fit.FITTING:
+            continue
         if not function.startswith("Group.") and good.keys() & {
             "t",
             "control_points",
@@ -149,11 +152,13 @@ def cases() -> Iterator[Case]:
     for function in ("bspline", "BSpline", "consistent_signs", "phantom_points", "initial_control_points"):
         yield from groups(function)
     yield refused("bspline", "control_points", "device", POSE.to("meta"), "meta", "cpu")
-    for function in ("bspline", "BSpline.evaluate", "Mounted.evaluate"):
+    for bad in ("Left", None, 1):
+        yield refused("BSpline.jacobians", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
+    for function in ("bspline", "BSpline.evaluate", "BSpline.jacobians", "Mounted.evaluate"):
         for bad in (4, -1, True, 1.0, None):
             yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
-    for function in ("bspline", "BSpline.evaluate", "Trajectory.forward", "Trajectory.kinematics", "Mounted.evaluate",
-                     "measure"):  # fmt: skip
+    for function in ("bspline", "BSpline.evaluate", "BSpline.jacobians", "Trajectory.forward",
+                     "Trajectory.kinematics", "Mounted.evaluate", "measure"):  # fmt: skip
         yield from times(function)
     for bad in (T, NS.int()):
         yield refused("bspline", "t", "dtype", bad, f"got {bad.dtype}", "int64", **ns)
@@ -208,6 +213,7 @@ def cases() -> Iterator[Case]:
     yield from fits()
     yield from alignments()
     yield from files()
+    yield from error_fit.cases()
 
 
 def fits() -> Iterator[Case]:
@@ -232,7 +238,14 @@ def fits() -> Iterator[Case]:
         came = f"got {int(not bad.isnan().all())}"
         yield refused(function, "t", "count", bad, came, "at least two distinct times")
     for name in ("dt", "position_sigma", "rotation_sigma", "smoothness"):
-        yield from numbers(function, name, 0.0, -1.0)
+        yield from (case for case in numbers(function, name, 0.0, -1.0) if case.changes != {"dt": "a"})
+    yield refused(function, "dt", "option", "Auto", "got 'Auto'", "'auto'")
+    for bad in (0.1, [0.1, 0.1], (0.1,), "tight"):
+        yield refused(function, "accuracy", "option", bad, f"got {bad!r}", "expected two numbers", dt="auto")
+    for number in (NAN, INF, 0.0, -1.0):
+        yield refused(function, "accuracy", "nan", (0.1, number), f"got {number}", "above zero", dt="auto")
+    yield refused(function, "accuracy", "type", ("a", 0.1), "got str", "a number", dt="auto")
+    yield refused(function, "accuracy", "option", (0.1, 0.1), "got dt=2.0", 'goes with dt="auto"')
     yield refused(function, "dt", "option", 1e-10, "got 1e-10 s", "at least a nanosecond", t=STAMPS.to(I64))
     yield from numbers(function, "tolerance", -1.0)
     yield from wholes(function, "order", 2, INF)

@@ -12,6 +12,9 @@ from error_cases import CASES
 
 import torchspline
 import torchspline.io as records
+from torchspline.fit.losses import Loss
+from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
 
@@ -68,7 +71,7 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Alignment"}
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Alignment"}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
@@ -76,6 +79,18 @@ UNTRIED = {
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
+    "Problem.prepare": "no arguments",
+    "Residual.bind": "tried through Problem.add, which calls it",
+    **{
+        getattr(kind, method).__qualname__: "called by the solver, on numbers that were checked"
+        for kinds, methods in (
+            (RESIDUALS.values(), ("evaluate", "reverse")),
+            (Loss.__subclasses__(), ("rho", "weight")),
+            ((Variable,), ("basis", "points", "retract")),
+        )
+        for kind in kinds
+        for method in methods
+    },
 }
 
 #: Parameters that take anything.
@@ -87,6 +102,8 @@ FREE = {
     "source": "goes into messages as it is",
     "name": "goes into messages as it is",
     "options": "those of BSpline, tried one by one",
+    "arguments": "those of the residual, tried one by one",
+    "index": "for arguments of the residual, tried with one",
 }
 
 _MAKERS = "Group Rn product use_kernels"
@@ -106,47 +123,70 @@ _QUATERNION = (
 )
 _POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
 _NEW = "Group.identity Group.random"
-_AT_TIMES = "BSpline.evaluate Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_AT_TIMES = "BSpline.evaluate BSpline.jacobians Trajectory.forward Trajectory.kinematics Mounted.evaluate"
 _ALIGNED = "Alignment.pose_time"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
+_RESIDUALS = " ".join(RESIDUALS)
+_WITHOUT_QUATERNIONS = " ".join(
+    name
+    for name, kind in RESIDUALS.items()
+    if name != "StateValue"
+    and not kind.measured_signs
+    and all(slot.group is None for slot in kind.slots.values())
+)
+_LOSSES = " ".join(loss.__name__ for loss in Loss.__subclasses__())
+_COVARIANCES = "Result.covariance Result.standard_deviation"
+_SOLVING = f"Problem.add_prior Problem.freeze Problem.release Problem.solve {_COVARIANCES}"
 
 #: Where a kind of mistake cannot be made: category -> reason -> functions.
 NOT_APPLICABLE = {
     "shape": {
-        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS}",
+        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_LOSSES} Problem.release Problem.solve {_COVARIANCES}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
         "any shape": _ALIGNED,
     },
     "dtype": {
-        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS}",
+        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_LOSSES} Problem Problem.release Problem.solve "
+        f"{_COVARIANCES}",
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
         "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_ALIGNED} consistent_signs "
         "phantom_points",
         "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
+        "measurements are copied to the CPU": f"{_RESIDUALS} Variable Clock smoothness Problem.add",
+        "no tensor that stays": f"{_LOSSES} {_SOLVING}",
     },
     "nan": {
         "no numbers": f"{_MAKERS} {_NEW} {_WINDOWS} from_scipy",
         "rows with NaN stay as they are": f"{_FILES} {_ALIGNED} PoseRecord ImuRecord",
+        "checked when the residual was made": "Problem.add",
+        "no numbers that can be one": f"Problem.freeze Problem.release {_COVARIANCES}",
     },
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
         f"from_scipy read_imu write_imu ImuRecord {_ALIGNED}",
         "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} align_imu",
         "rows stay as they are until they are used": "PoseRecord",
+        "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
+        "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
+        "Result.trajectory_covariance",
     },
     "count": {
         "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_ALIGNED} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
+        "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
+        f"Problem.add Result.trajectory_covariance {_SOLVING}",
     },
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
         "SplitBSpline Trajectory.mounted Mounted",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
         "any time, also none at all": f"{_FILES} {_WINDOWS} {_ALIGNED} PoseRecord ImuRecord",
+        "no trajectory to lie on before Problem.add": f"{_RESIDUALS} {_LOSSES} Variable Clock",
+        "times come with residuals": f"smoothness Problem {_SOLVING}",
     },
 }
 

@@ -1,6 +1,6 @@
 """torchspline: continuous-time motion as a PyTorch layer."""
 
-from torchspline import functional, imu
+from torchspline import fit, functional, imu
 from torchspline.fit import Alignment, PoseFit, align_imu, fit_poses
 from torchspline.groups import R3, SE3, SO3, Group, Rn, convert, product
 from torchspline.kernels.mode import use_kernels
@@ -33,6 +33,7 @@ __all__ = [
     "align_imu",
     "consistent_signs",
     "convert",
+    "fit",
     "fit_poses",
     "functional",
     "imu",

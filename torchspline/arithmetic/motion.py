@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from torchspline.arithmetic.so3 import rotate, unrotate
-from torchspline.arithmetic.vector import Vector, add, cross, zero
+from torchspline.arithmetic.vector import Vector, add, cross, negate, zero
 
 _NONE = zero(3)
 
@@ -146,6 +146,21 @@ def turned(q: Vector, v: Vector) -> Vector:
 def turned_reverse(q: Vector, seen: Vector, g: Vector) -> tuple[Vector, Vector]:
     """Cotangents of the rotation (its own body tangent) and of the vector, from that of what is `seen`."""
     return cross(g, seen), rotate(q, g)
+
+
+def sighted(motion: Motion, T: Vector, point: Vector) -> Vector:
+    """A point of the world as seen from a frame with pose T in the body."""
+    inside = unrotate(motion.q, add(point, negate(motion.p)))
+    return turned(T[3:], add(inside, negate(T[:3])))
+
+
+def sighted_reverse(motion: Motion, T: Vector, point: Vector, g: Vector) -> tuple[Motion, Vector, Vector]:
+    """Cotangents of the motion, of T (body tangent) and of the point, from that of what is seen."""
+    inside = unrotate(motion.q, add(point, negate(motion.p)))
+    seen = turned(T[3:], add(inside, negate(T[:3])))
+    turn_g, inside_g = turned_reverse(T[3:], seen, g)
+    point_g = rotate(motion.q, inside_g)
+    return Motion(q=cross(inside_g, inside), p=negate(point_g)), (*negate(g), *turn_g), point_g
 
 
 def _two(rates: Sequence[Vector], size: int) -> tuple[Vector, Vector]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.model import Model, State
@@ -24,7 +25,7 @@ class Bends:
 
     def __init__(self, model: Model, weight: Array):
         spline = model.trajectory
-        self.weight = weight
+        self.weight, self.module = weight, spline.module
         self.span = min(3, spline.count)
         first = np.arange(spline.count - self.span + 1)
         own = model.columns[id(spline.module)]
@@ -37,6 +38,13 @@ class Bends:
     def touched(self, state: State) -> Array:
         """Columns of the unknowns of each run."""
         return self.columns
+
+    def cost_of(self, numbers: dict[int, torch.Tensor]) -> torch.Tensor:
+        """The cost as differentiable operations."""
+        group, points = self.module.group, numbers[id(self.module)]
+        logs = group.log(group.between(points[:-1], points[1:], validate=False), validate=False)
+        bends = logs.diff(dim=0) if self.span == 3 else logs
+        return 0.5 * (bends * torch.from_numpy(self.weight)).square().sum()
 
     def add_to(self, system: System, state: State) -> None:
         """Add cost and normal equations."""

@@ -36,6 +36,9 @@ class Spline:
         self.segments = self.count - self.order + 1
         self.size = self.group.tangent_size
         self.local = LocalSpline(self.name, self.order, self.spacing, self.count)
+        #: How far outside times may lie, in segments: seconds since an epoch are rounded, the origin included.
+        rounding = 0.0 if isinstance(origin, int) else abs(origin) / self.spacing
+        self.slack = 1e-9 + 8 * np.finfo(np.float64).eps * (rounding + self.segments)
         self._blending = np.array(blending_matrix(self.order), dtype=np.float64)
 
     def place(self, tau: Array) -> tuple[Array, Array, Array]:
@@ -43,8 +46,7 @@ class Spline:
         s = (tau - self.start) / self.spacing
         base = np.clip(np.floor(s), 0, self.segments - 1)
         u = s - base
-        slack = 1e-9 + 8 * np.finfo(np.float64).eps * self.segments
-        outside = (u < -slack) | (u > 1.0 + slack)
+        outside = (u < -self.slack) | (u > 1.0 + self.slack)
         return base.astype(np.int64), np.clip(u, 0.0, 1.0), outside
 
     def blending(self, u: Array) -> Array:
@@ -156,10 +158,13 @@ class Model:
         return State(points, values, local, self.trajectory.local.pair_jacobians(local))
 
     def store(self, state: State) -> None:
-        """Write the numbers back."""
+        """Write the numbers of what may move back; the rest keeps its own, quaternions of any length included."""
         for spline in self.splines:
+            key = id(spline.module)
+            index = torch.from_numpy(np.flatnonzero(self.columns[key][:, 0] >= 0))
             with torch.no_grad():
                 target = spline.module.control_points
-                target.copy_(torch.from_numpy(state.points[id(spline.module)]).to(target))
+                target[index] = torch.from_numpy(state.points[key]).to(target)[index]
         for variable in self.variables:
-            variable.value = state.values[id(variable)].clone()
+            if id(variable) in self.columns:
+                variable.value = state.values[id(variable)].clone()

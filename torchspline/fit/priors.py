@@ -50,6 +50,17 @@ class BoundPrior:
         """Columns of the unknowns, one run."""
         return self.columns[None]
 
+    def cost_of(self, numbers: dict[int, torch.Tensor]) -> torch.Tensor:
+        """The cost as differentiable operations."""
+        steps = []
+        for part in self.prior.parts:
+            now = numbers[id(part.unknown)]
+            now = now.reshape(-1, now.shape[-1])[torch.from_numpy(np.asarray(part.points))]
+            steps.append(_block_step(part, now).reshape(-1))
+        x = torch.cat(steps)
+        H, g = torch.from_numpy(self.prior.information), torch.from_numpy(self.prior.slope)
+        return 0.5 * x @ H @ x + g @ x + self.prior.constant
+
     def add_to(self, system: System, state: State) -> None:
         """Add cost and normal equations; the steps' own Jacobians are those of the logarithm."""
         steps, jacobians = [], []
@@ -63,26 +74,38 @@ class BoundPrior:
         system.add_dense(self.columns, J.T @ H @ J, J.T @ (H @ x + g))
 
 
+def _block_step(part: Part, now: torch.Tensor) -> torch.Tensor:
+    """Tangents from the reference to `now` (C, D), differentiable."""
+    unknown, reference = part.unknown, part.reference
+    if isinstance(unknown, Variable) and unknown.sphere:
+        basis = unknown.basis(reference)
+        assert basis is not None
+        back = basis.mT / reference.square().sum(-1)[:, None, None]
+        return (back @ (now - reference).unsqueeze(-1)).squeeze(-1)
+    if unknown.group is None:
+        return now - reference
+    return unknown.group.log(unknown.group.between(reference, now, validate=False), validate=False)
+
+
 def _step(part: Part, state: State) -> tuple[Array, Array]:
     """Tangents from the reference to where the unknowns stand (C, D), and their Jacobians (C, D, D)."""
-    unknown, reference = part.unknown, part.reference
+    unknown = part.unknown
     if isinstance(unknown, BSpline):
         now = torch.from_numpy(state.points[id(unknown)][part.points])
-        group = unknown.group
     else:
         now = state.values[id(unknown)].reshape(-1, unknown.size)[part.points]
-        if unknown.sphere:  # the change of the vector, seen from the basis at the reference
-            at_reference, at_now = unknown.basis(reference), unknown.basis(now)
-            assert at_reference is not None
-            assert at_now is not None
-            back = at_reference.mT / reference.square().sum(-1)[:, None, None]
-            return (back @ (now - reference).unsqueeze(-1)).squeeze(-1).numpy(), (back @ at_now).numpy()
-        if unknown.group is None:
-            size = unknown.dimension
-            return (now - reference).numpy(), np.broadcast_to(np.eye(size), (len(now), size, size))
-        group = unknown.group
-    step = group.log(group.between(reference, now, validate=False), validate=False)
-    return step.numpy(), group.right_jacobian_inverse(step, validate=False).numpy()
+    step = _block_step(part, now)
+    if isinstance(unknown, Variable) and unknown.sphere:
+        # The change of the vector, seen from the basis at the reference.
+        at_reference, at_now = unknown.basis(part.reference), unknown.basis(now)
+        assert at_reference is not None
+        assert at_now is not None
+        jacobian = at_reference.mT @ at_now / part.reference.square().sum(-1)[:, None, None]
+    elif unknown.group is None:
+        jacobian = torch.eye(step.shape[-1], dtype=step.dtype).expand(len(step), -1, -1)
+    else:
+        jacobian = unknown.group.right_jacobian_inverse(step, validate=False)
+    return step.numpy(), jacobian.numpy()
 
 
 def _block_diagonal(blocks: list[Array]) -> Array:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit.bends import Bends
+from torchspline.fit.implicit import differentiable as of_solution
 from torchspline.fit.model import Model, Spline, State, Unknown
 from torchspline.fit.priors import BoundPrior, Part, Prior
 from torchspline.fit.progress import progress_bar
@@ -60,29 +61,33 @@ class Problem:
         for slot, x in residual.arguments.items():
             if isinstance(x, Variable) and x.value.ndim == 2 and slot not in indices:
                 raise ValueError(
-                    f"{slot}: {x.name} holds several; say which each measurement sees: {slot}=index"
+                    f"{slot}: {x.name} holds {len(x.value)}; expected {slot}=index, which of them each measurement "
+                    "sees, got none"
                 )
         self._check_times(residual)
-        unknowns = [x for x in (*residual.arguments.values(), *residual.clock[:2], residual.clock.delay)
-                    if isinstance(x, (Variable, BSpline))]  # fmt: skip
-        for x in unknowns:
-            self._register(x)
+        unknowns = [
+            x
+            for x in (*residual.arguments.values(), *residual.clock.unknowns)
+            if isinstance(x, (Variable, BSpline))
+        ]
+        self._unknowns += self._new(unknowns)
         self.residuals.append(residual)
         self._indices.append(indices)
         return residual
 
-    def _register(self, unknown: Unknown) -> None:
-        if any(x is unknown for x in self._unknowns):
-            return
-        if isinstance(unknown, BSpline):
-            _check_spline("spline", unknown)
-            if (unknown.dt_ns is None) != (self.trajectory.dt_ns is None):
-                raise TypeError(
-                    "spline: expected the trajectory's kind of time, seconds or nanoseconds, for both"
-                )
-        elif any(isinstance(x, Variable) and x.name == unknown.name for x in self._unknowns):
-            raise ValueError(f"variable: a name stands for one unknown, got two called {unknown.name!r}")
-        self._unknowns.append(unknown)
+    def _new(self, unknowns: list[Unknown]) -> list[Unknown]:
+        """Those not known yet, each once; nothing is added before all were looked at."""
+        new: list[Unknown] = []
+        for x in unknowns:
+            known = [*self._unknowns, *new]
+            if any(y is x for y in known):
+                continue
+            if isinstance(x, BSpline):
+                _check_spline("spline", x)
+            elif any(isinstance(y, Variable) and y.name == x.name for y in known):
+                raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
+            new.append(x)
+        return new
 
     def _check_times(self, residual: Residual) -> None:
         t, domain = residual.t.detach(), self.trajectory.domain
@@ -91,15 +96,17 @@ class Problem:
                 f"t: {residual.name} has {t.dtype} times; expected those of the trajectory, "
                 f"{'int64 nanoseconds' if self.trajectory.dt_ns is not None else 'float64 seconds'}"
             )
-        if residual.clock != type(residual.clock)():
+        for slot, x in residual.arguments.items():
+            if isinstance(x, BSpline) and (x.dt_ns is None) != (self.trajectory.dt_ns is None):
+                raise TypeError(
+                    f"{slot}: expected a spline with the trajectory's kind of time, got seconds and nanoseconds"
+                )
+            if isinstance(x, BSpline) and (message := _outside(residual, t.reshape(-1), x.domain)):
+                raise ValueError(f"{slot}: {message} of its spline; expected one that covers them")
+        if residual.clock.unknowns:
             return  # where they lie on the trajectory is unknown; those outside are left out while they are
-        slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0])
-        outside = (t < domain[0] - slack) | (t > domain[1] + slack)
-        if bool(outside.any()):
-            raise ValueError(
-                f"t: {int(outside.sum())} of {outside.numel()} times of {residual.name} lie outside the trajectory's "
-                f"domain {list(domain)}, the first is {t[outside][0].item()!r}; leave them out or extend the trajectory"
-            )
+        if message := _outside(residual, t, domain):
+            raise ValueError(f"t: {message} of the trajectory; leave them out or extend the trajectory")
 
     def add_prior(
         self,
@@ -122,13 +129,14 @@ class Problem:
         if sigma is None and covariance is None and information is None:
             raise ValueError("sigma, covariance, information: expected one of them, got none")
         size, count = variable.dimension, variable.value.shape[:-1].numel()
-        root = square_root_information(weighting_of(sigma, covariance, information, size, count))
+        kind, x = weighting_of(sigma, covariance, information, size, count)
+        if x is not None and x.ndim > (1 if kind == "sigma" else 2):
+            raise ValueError(f"{kind}: expected one for all of several unknowns, got shape {tuple(x.shape)}")
+        root = square_root_information((kind, x))
         assert root is not None
         root = root.detach().cpu()
         matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
-        if matrix.shape != (size, size):
-            raise ValueError(f"sigma: expected a number or shape ({size},), got one for each of several")
-        self._register(variable)
+        self._unknowns += self._new([variable])
         reference = variable.points(variable.value).reshape(count, -1)
         H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
         self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
@@ -139,28 +147,32 @@ class Problem:
         Args:
             points: which control points stay, (M,) bool; None for all.
         """
-        if not any(x is unknown for x in self._unknowns):
-            raise ValueError(
-                f"unknown: expected the trajectory or an unknown of a residual that was added, got {unknown!r}"
-            )
+        self._known("unknown", unknown)
         if isinstance(unknown, Variable):
             if points is not None:
-                raise ValueError("points: only splines have control points")
+                raise ValueError(f"points: only splines have control points, got {unknown!r}; expected None")
             self._frozen[id(unknown)] = True
             return
         count = unknown.control_points.shape[-2]
         if points is None:
             points = torch.ones(count, dtype=torch.bool)
         checks.instance("points", points, Tensor, "a bool tensor")
-        if points.shape != (count,) or points.dtype != torch.bool:
-            raise ValueError(
-                f"points: expected bool of shape ({count},), got {points.dtype} {tuple(points.shape)}"
-            )
+        if points.dtype != torch.bool:
+            raise TypeError(f"points: expected dtype torch.bool, got {points.dtype}")
+        if points.shape != (count,):
+            raise ValueError(f"points: expected shape ({count},), got {tuple(points.shape)}")
         self._frozen[id(unknown)] = points.cpu().numpy()
 
     def release(self, unknown: Unknown) -> None:
         """Undo `freeze`."""
+        self._known("unknown", unknown)
         self._frozen.pop(id(unknown), None)
+
+    def _known(self, name: str, unknown: Unknown) -> None:
+        if not any(x is unknown for x in self._unknowns):
+            raise ValueError(
+                f"{name}: expected the trajectory or an unknown of a residual that was added, got {unknown!r}"
+            )
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -176,6 +188,7 @@ class Problem:
         cost_tolerance: float = 1e-9,
         gradient_tolerance: float = 1e-8,
         damping: float = 1e-5,
+        differentiable: bool = False,
         progress: bool = False,
     ) -> Result:
         """Move all unknowns to where the sum of squares is least, by Levenberg-Marquardt.
@@ -185,6 +198,10 @@ class Problem:
             cost_tolerance: stop when a step lowers the cost by less than this share.
             gradient_tolerance: stop when every unknown is this near to its optimum, in its standard deviations.
             damping: what to start from, as a share of the diagonal.
+            differentiable: let `result.control_points` and `result.values` carry gradients, by the implicit function
+                theorem, to every tensor with `requires_grad` among times, measurements, standard deviations,
+                covariances and known arguments. Once: not for second derivatives. Gradients are as exact as the
+                solution, so ask for small tolerances.
             progress: show a progress bar on a terminal.
         Returns:
             Result. Control points and the `value` of variables are replaced in place.
@@ -206,11 +223,15 @@ class Problem:
                 raise ValueError("solve: everything is frozen")
             state, system, trace = minimise(model, model.state(), linearizer, options, show)
             model.store(state)
-        return Result(linearizer, state, system, trace)
+        numbers = of_solution(linearizer, state, system) if differentiable else None
+        return Result(linearizer, state, system, trace, numbers)
 
     def prepare(self) -> "Linearizer":
         """The problem in arrays."""
         origin = self.trajectory.domain[0]
+        for x in self._unknowns:
+            if isinstance(x, BSpline):
+                _check_spline("trajectory" if x is self.trajectory else "spline", x)
         splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, self._frozen)
@@ -257,14 +278,34 @@ def _check_spline(name: str, spline: BSpline) -> None:
         )
     if points.device.type != "cpu":
         raise ValueError(f"{name}: expected one on the CPU, got {points.device}; move it with .to('cpu')")
+    checks.finite(name, points)
+    checks.quaternions(name, points, spline.group.arithmetic.sign_blocks)
+
+
+def _outside(residual: Residual, t: Tensor, domain: tuple[float, float]) -> str:
+    """What is wrong with the times of a residual; nothing if they lie in the domain, up to rounding."""
+    rounding = 8 * torch.finfo(torch.float64).eps * max(map(abs, domain))
+    slack = 0 if t.dtype == torch.int64 else 1e-9 * (domain[1] - domain[0]) + rounding
+    outside = (t < domain[0] - slack) | (t > domain[1] + slack)
+    if not bool(outside.any()):
+        return ""
+    return (
+        f"{int(outside.sum())} of {outside.numel()} times of {residual.name}, the first {t[outside][0].item()!r}, "
+        f"lie outside the domain {list(domain)}"
+    )
 
 
 def _index(residual: Residual, slot: str, x: Any) -> Array:
     variable = residual.arguments.get(slot)
     if not isinstance(variable, Variable) or variable.value.ndim != 2:
-        raise ValueError(f"{slot}: only an argument that is a Variable of several takes an index")
-    if not isinstance(x, Tensor) or x.dtype != torch.int64 or x.shape != (len(residual),):
-        raise ValueError(f"{slot}: expected an int64 index of shape ({len(residual)},)")
+        raise ValueError(
+            f"{slot}: an index is expected only with a Variable of several, shape (L, n), got {variable!r}"
+        )
+    checks.instance(slot, x, Tensor, "an int64 index, a torch.Tensor")
+    if x.dtype != torch.int64:
+        raise TypeError(f"{slot}: expected an index of dtype torch.int64, got {x.dtype}")
+    if x.shape != (len(residual),):
+        raise ValueError(f"{slot}: expected an index of shape ({len(residual)},), got {tuple(x.shape)}")
     index = x.cpu().numpy()
     count = variable.value.shape[0]
     if index.size and (index.min() < 0 or index.max() >= count):

@@ -8,6 +8,7 @@ and the graph that a differentiable optimum needs. A new residual is one file in
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -16,6 +17,8 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS
+from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
+from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import Vector
 from torchspline.fit.losses import Loss
 from torchspline.fit.variables import Variable
@@ -45,18 +48,52 @@ class Moment(NamedTuple):
     rates: tuple[Vector, ...]
 
 
-class Clock(NamedTuple):
-    """How the stamps of a sensor relate to the time of the trajectory: `t_sensor = t + offset + skew (t - mid)`."""
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """How the stamps of a sensor relate to the time of the trajectory.
 
-    #: Unknowns of one number each, s and s/s, or None.
+    `t_sensor = t + offset + skew (t - mid) + delay late`. Measurements that the unknowns move out of the trajectory's
+    domain take no part while they are there.
+
+    Args:
+        offset, skew: unknowns of one number each, s and s/s.
+        mid: time of the trajectory at which the skew turns, in the unit of its times; by default the middle of its
+            domain.
+        delay: an unknown of one number, s: the line delay of a rolling shutter. late: by how many delays each
+            measurement is later, (N,), such as the line it was seen on.
+    Raises:
+        TypeError, ValueError: a wrong type or shape, or one of `delay` and `late` without the other.
+    """
+
     offset: Variable | None = None
     skew: Variable | None = None
-    #: Time of the trajectory at which the skew turns, in the unit of the times.
-    mid: float | int = 0
-    #: An unknown of one number, s, by which each measurement is later times its own factor `late` (N,): the line delay
-    #: of a rolling shutter.
+    mid: float | int | None = None
     delay: Variable | None = None
     late: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("offset", "skew", "delay"):
+            x = getattr(self, name)
+            if x is None:
+                continue
+            checks.instance(name, x, Variable, "a torchspline.fit.Variable")
+            if x.group is not None or x.value.shape != (1,):
+                raise ValueError(f"{name}: expected a Variable of one number, shape (1,), got {x!r}")
+        if self.mid is not None:
+            checks.finite_number("mid", self.mid)
+        if (self.delay is None) != (self.late is None):
+            missing, there = ("delay", "late") if self.delay is None else ("late", "delay")
+            raise ValueError(f"{missing}: got None; expected delay and late together, and {there} is there")
+        if self.late is not None:
+            checks.is_floating_tensor("late", self.late)
+            if self.late.ndim != 1:
+                raise ValueError(f"late: expected shape (N,), got {tuple(self.late.shape)}")
+            checks.finite("late", self.late)
+
+    @property
+    def unknowns(self) -> tuple[Variable, ...]:
+        """Offset, skew and delay, those that there are."""
+        return tuple(x for x in (self.offset, self.skew, self.delay) if x is not None)
 
 
 class Residual(ABC):
@@ -71,7 +108,8 @@ class Residual(ABC):
         loss: a robust loss, see `losses.py`.
         clock: how the sensor's times relate to those of the trajectory.
         name: what results call it; the default is the class's name.
-        arguments: for each of `slots` a `Variable`, a spline of it, or its value; what has a default may be missing.
+        arguments: for each of `slots` a `Variable`, a spline of it, or its value, (n,) or (N, n) if each measurement
+            has its own; what has a default may be missing.
     Raises:
         TypeError, ValueError: a wrong type, shape or value.
     """
@@ -106,21 +144,29 @@ class Residual(ABC):
             checks.instance("loss", loss, Loss, "a robust loss such as torchspline.fit.Huber(1.0)")
         if clock is not None:
             checks.instance("clock", clock, Clock, "a torchspline.fit.Clock")
+            _check_clock(clock, t, len(measured), self.derivatives)
         self.loss, self.clock = loss, clock or Clock()
         self._weights = sigma, covariance, information
         self.weighting: tuple[str, Tensor | None] = ("sigma", None)
         if self.rows is not None and self.measured_size is not None:
             self._check_sizes(self.rows, self.measured_size, self.measured_signs)
-        unknown = set(arguments) - set(self.slots)
-        if unknown:
-            raise TypeError(
-                f"{type(self).__name__}: unexpected argument {sorted(unknown)[0]!r}; it takes "
-                f"{', '.join(self.slots) or 'none besides the measurement'}"
-            )
-        self.arguments = {name: _argument(name, x, self.slots[name]) for name, x in arguments.items()}
+        for slot in arguments:
+            if slot not in self.slots:
+                raise TypeError(
+                    f"{slot}: {type(self).__name__} takes no such argument; it takes "
+                    f"{', '.join(self.slots) or 'none besides the measurement'}"
+                )
+        # In the order of the slots, however they were given: one kernel for each set of them.
+        self.arguments = {
+            slot: _argument(slot, arguments[slot], kind, len(measured))
+            for slot, kind in self.slots.items()
+            if slot in arguments
+        }
         for slot, (_, _, default) in self.slots.items():
             if slot not in arguments and default is None:
-                raise TypeError(f"{type(self).__name__}: argument {slot!r} is missing")
+                raise TypeError(
+                    f"{slot}: {type(self).__name__} needs a Variable, a spline or its value, got none"
+                )
 
     def _check_sizes(self, rows: int, measured_size: int, signs: Sequence[tuple[int, int]]) -> None:
         count = self.measured.shape[0]
@@ -262,7 +308,19 @@ def square_root_information(weighting: tuple[str, Tensor | None]) -> Tensor | No
     )
 
 
-def _argument(name: str, x: Any, slot: Slot) -> Argument:
+def _check_clock(clock: Clock, t: Tensor, count: int, derivatives: int) -> None:
+    if t.dtype == torch.int64 and isinstance(clock.mid, float):
+        raise TypeError(f"clock: with int64 times, mid is a whole number of nanoseconds, got {clock.mid!r}")
+    if clock.late is not None and clock.late.shape != (count,):
+        raise ValueError(f"clock: expected late of shape ({count},), got {tuple(clock.late.shape)}")
+    if clock.unknowns and derivatives >= MAX_DERIVATIVES:
+        raise ValueError(
+            f"clock: a residual of the derivative number {derivatives} moves with time by the next one, which splines "
+            "do not give; got unknowns of time, expected none"
+        )
+
+
+def _argument(name: str, x: Any, slot: Slot, count: int) -> Argument:
     if isinstance(x, Variable):
         group = x.group.name if x.group is not None else None
         if x.size != slot.size or group != slot.group:
@@ -277,9 +335,13 @@ def _argument(name: str, x: Any, slot: Slot) -> Argument:
             )
     elif isinstance(x, Tensor):
         checks.is_floating_tensor(name, x)
-        if x.shape != (slot.size,):
-            raise ValueError(f"{name}: expected shape ({slot.size},), got {tuple(x.shape)}")
+        if x.shape not in ((slot.size,), (count, slot.size)):
+            raise ValueError(
+                f"{name}: expected shape ({slot.size},) or ({count}, {slot.size}), got {tuple(x.shape)}"
+            )
         checks.finite(name, x)
+        if slot.group is not None:
+            checks.quaternions(name, x, arithmetic(slot.group).sign_blocks)
     else:
         raise TypeError(f"{name}: expected a Variable, a BSpline or a tensor, got {type(x).__name__}")
     return x

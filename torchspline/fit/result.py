@@ -46,8 +46,22 @@ class Direction:
 class Result:
     """Of `Problem.solve`. Covariances hold at the solution, for the standard deviations that were given."""
 
-    def __init__(self, linearizer: "Linearizer", state: State, system: System, trace: Trace):
+    def __init__(
+        self,
+        linearizer: "Linearizer",
+        state: State,
+        system: System,
+        trace: Trace,
+        numbers: dict[int, Tensor] | None,
+    ):
         self._linearizer, self._state, self._system = linearizer, state, system
+        model = linearizer.model
+        if numbers is None:
+            points = {key: torch.from_numpy(x).clone() for key, x in state.points.items()}
+            numbers = points | {key: x.clone() for key, x in state.values.items()}
+        #: The trajectory's control points, unit, and the variables' values by name; with a graph if so asked.
+        self.control_points = numbers[id(model.trajectory.module)]
+        self.values = {v.name: numbers[id(v)] for v in model.variables}
         #: Half the (robust) weighted sum of squares at the start and after each accepted step.
         self.cost = list(trace.cost)
         #: Damping along with it.
@@ -142,6 +156,8 @@ class Result:
             ValueError: a time outside the domain; the measurements do not determine all unknowns.
         """
         model = self._linearizer.model
+        if isinstance(t, Tensor) and t.ndim > 1:
+            raise ValueError(f"t: expected shape (N,) or (), got {tuple(t.shape)}")
         spline, trajectory = model.trajectory, model.trajectory.module
         jacobians = trajectory.jacobians(t, derivatives, side="right")
         stacked = torch.cat([x for x in jacobians[1 : 2 + derivatives] if x is not None], dim=-2).double()

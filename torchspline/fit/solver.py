@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from torchspline.fit.model import Model, State
 from torchspline.fit.system import Factor, SingularError, System
+from torchspline.kernels.mode import RefusedError
 
 Array = NDArray[Any]
 #: Damping is a share of the diagonal, which is taken to be at least this share of its largest element.
 _LEAST_DIAGONAL = 1e-12
 _MOST_DAMPING = 1e12
+#: Shares of the cost below which its differences are noise.
+_ROUNDING = 1e-11
 
 
 @dataclass(frozen=True)
@@ -84,16 +87,17 @@ def minimise(
         clock = trace.spend("solve", clock)
         gain, candidate, fresh = -1.0, state, system
         if step is not None:
-            candidate = model.moved(state, step)
-            clock = trace.spend("update", clock)
-            fresh = linearize(candidate)
+            expected = 0.5 * float(step @ (damping * scale * step - system.right))
+            try:
+                candidate = model.moved(state, step)
+                clock = trace.spend("update", clock)
+                fresh = linearize(candidate)
+                gain = _gain(system, fresh, expected)
+            except RefusedError:  # so far away that control points are no numbers any more
+                gain = -1.0
             clock = trace.spend("linearize", clock)
             trace.evaluations += 1
-            expected = 0.5 * float(step @ (damping * scale * step - system.right))
-            gain = (
-                (system.cost - fresh.cost) / expected if math.isfinite(fresh.cost) and expected > 0 else -1.0
-            )
-            if gain <= 0 and expected <= options.cost * system.cost:
+            if gain <= 0 and expected <= max(options.cost, _ROUNDING) * system.cost:
                 trace.reason, trace.converged = "no step lowers the cost any more", True
                 return state, system, trace
         if gain > 0:
@@ -112,6 +116,25 @@ def minimise(
                 return state, system, trace
     trace.reason = f"reached {options.iterations} iterations"
     return state, system, trace
+
+
+def _gain(before: System, after: System, expected: float) -> float:
+    """The fall of the cost as a share of what was expected.
+
+    Where that is lost in the rounding of the cost, a smaller gradient tells a better place.
+    """
+    if not math.isfinite(after.cost) or not expected > 0:
+        return -1.0
+    if expected > _ROUNDING * before.cost:
+        return (before.cost - after.cost) / expected
+    return 1.0 if _slope(after) < _slope(before) else -1.0
+
+
+def _slope(system: System) -> float:
+    """Squared gradient, every unknown in its own standard deviations."""
+    diagonal = system.diagonal()
+    there = diagonal > 0
+    return float(np.square(system.right[there]) @ (1.0 / diagonal[there]))
 
 
 def _step(system: System, damping: Array) -> Array | None:

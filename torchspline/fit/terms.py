@@ -1,6 +1,7 @@
 """One residual inside a problem: its measurements in order of time, and its part of the normal equations."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import NANOSECOND, Model, State
+from torchspline.fit.model import NANOSECOND, Model, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
@@ -41,30 +42,28 @@ class Term:
     """A residual bound to the unknowns of a problem."""
 
     def __init__(self, residual: Residual, model: Model, origin: float | int, index: dict[str, Array]):
-        self.residual, self.model = residual, model
+        self.residual, self.model, self.origin = residual, model, origin
         kind = type(residual)
-        tau = _seconds(residual.t.detach().cpu().reshape(kind.moments, -1), origin)
+        tau = seconds_of(residual.t.detach().cpu().reshape(kind.moments, -1), origin).numpy()
         self.order = np.argsort(tau[0], kind="stable")
         if np.array_equal(self.order, np.arange(len(self.order))):
             self.order = np.arange(len(self.order))
         self.tau = np.ascontiguousarray(tau[:, self.order])
-        self.mid = (
-            float(_seconds(torch.as_tensor(residual.clock.mid), origin)) if residual.clock.skew else 0.0
-        )
-        self.late = None
-        if residual.clock.late is not None:
-            self.late = residual.clock.late.detach().cpu().to(torch.float64).numpy()[self.order]
+        mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing
+        self.mid = 0.5 * length if mid is None else seconds(mid, origin)
         self.measured = residual.measured.detach().cpu().to(torch.float64).numpy()[self.order]
         self.index = {slot: x[self.order] for slot, x in index.items()}
         self.weights = self._weights()
+        #: Known arguments of which each measurement has its own.
+        self.each = {
+            slot for slot, x in residual.arguments.items() if isinstance(x, torch.Tensor) and x.ndim == 2
+        }
         given = tuple(
-            (slot, isinstance(x, BSpline) or slot in index) for slot, x in residual.arguments.items()
+            (slot, isinstance(x, BSpline) or slot in index or slot in self.each)
+            for slot, x in residual.arguments.items()
         )
         self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
-        self.clock = [
-            v for v in (residual.clock.offset, residual.clock.skew, residual.clock.delay)
-            if v is not None and id(v) in model.columns
-        ]  # fmt: skip
+        self.clock = [v for v in residual.clock.unknowns if id(v) in model.columns]
         self.splines = {
             slot: next(s for s in model.splines if s.module is x)
             for slot, x in residual.arguments.items()
@@ -126,10 +125,14 @@ class Term:
             rows = self.index[slot][first] if slot in self.index else np.zeros(len(first), np.int64)
             columns.append(own[rows])
         columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
+        blocks = [c.reshape(len(first), math.prod(c.shape[1:])) for c in columns]
+        bases = (
+            np.stack([b[first] for b in moving], axis=1) if moving else np.empty((len(first), 0), np.int64)
+        )
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
-            np.array([b[first] for b in moving], np.int64).reshape(-1, len(first)).T.copy(),
-            np.ascontiguousarray(np.concatenate([c.reshape(len(first), -1) for c in columns], axis=1)),
+            np.ascontiguousarray(bases),
+            np.ascontiguousarray(np.concatenate(blocks, axis=1)),
             rates,
         )  # fmt: skip
         if not self.clock:
@@ -139,15 +142,13 @@ class Term:
     def _times(self, state: State) -> tuple[Array, list[tuple[Variable, Array]]]:
         """Times of the trajectory, and how they move with the unknowns of the clock."""
         clock = self.residual.clock
-        number = {
-            v.name: float(state.values[id(v)][0])
-            for v in (clock.offset, clock.skew, clock.delay)
-            if v is not None
+        numbers = {
+            id(v): state.values[id(v)][0] for v in (clock.offset, clock.skew, clock.delay) if v is not None
         }
-        value = lambda v: 0.0 if v is None else number[v.name]  # noqa: E731
-        rate = 1.0 + value(clock.skew)
-        late = 0.0 if self.late is None else value(clock.delay) * self.late
-        tau = self.mid + (self.tau - self.mid - value(clock.offset) - late) / rate
+        tau = self.clocked(
+            torch.from_numpy(self.tau), numbers, lambda late: late[torch.from_numpy(self.order)]
+        ).numpy()
+        rate = 1.0 if clock.skew is None else 1.0 + float(numbers[id(clock.skew)])
         rates: list[tuple[Variable, Array]] = []
         for v in self.clock:
             if v is clock.offset:
@@ -155,9 +156,28 @@ class Term:
             elif v is clock.skew:
                 rates.append((v, -(tau - self.mid) / rate))
             else:
-                assert self.late is not None
-                rates.append((v, np.broadcast_to(-self.late / rate, tau.shape)))
+                assert clock.late is not None
+                late = clock.late.detach().cpu().to(torch.float64).numpy()[self.order]
+                rates.append((v, np.broadcast_to(-late / rate, tau.shape)))
         return tau, rates
+
+    def clocked(
+        self,
+        sensor: torch.Tensor,
+        numbers: dict[int, torch.Tensor],
+        of: Callable[[torch.Tensor], torch.Tensor],
+    ) -> torch.Tensor:
+        """Times of the trajectory from those of the sensor, seconds; `of` puts `late` in their order."""
+        clock = self.residual.clock
+        shift = sensor - self.mid
+        if clock.offset is not None:
+            shift = shift - numbers[id(clock.offset)]
+        if clock.delay is not None:
+            assert clock.late is not None
+            shift = shift - numbers[id(clock.delay)] * of(clock.late).to(torch.float64)
+        if clock.skew is not None:
+            shift = shift / (1.0 + numbers[id(clock.skew)])
+        return self.mid + shift
 
     # ------------------------------------------------------------------ what
 
@@ -241,6 +261,8 @@ class Term:
             if isinstance(x, Variable)
             else x.detach().cpu().to(torch.float64).numpy()
         )
+        if slot in self.each:
+            return value[self.order[part]]
         return value[self.index[slot][part]] if slot in self.index else value.reshape(-1)
 
     def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, float]:
@@ -299,7 +321,8 @@ def _chunks(starts: Array, size: int) -> Iterator[tuple[int, int, int, int]]:
         first = last
 
 
-def _seconds(t: torch.Tensor, origin: float | int) -> Array:
+def seconds_of(t: torch.Tensor, origin: float | int) -> torch.Tensor:
+    """Times as seconds from the origin, float64."""
     if t.dtype == torch.int64:
-        return (t - int(origin)).numpy().astype(np.float64) * NANOSECOND
-    return (t.to(torch.float64) - origin).numpy()
+        return (t - int(origin)).to(torch.float64) * NANOSECOND
+    return t.to(torch.float64) - origin

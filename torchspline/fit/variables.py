@@ -42,7 +42,7 @@ class Variable:
                     f"sphere: expected a value of three numbers and no group, got {tuple(value.shape)}, group {group}"
                 )
             if not bool((value.detach().norm(dim=-1) > 0).all()):
-                raise ValueError("value: a direction on a sphere needs a length above zero")
+                raise ValueError("value: expected a length above zero of a direction on a sphere, got 0")
         self.name, self.group, self.sphere = name, group, sphere
         self.value = value.detach().to("cpu", torch.float64).clone()
         #: Numbers that store one of them, and its degrees of freedom.

@@ -1,20 +1,14 @@
 """What an accelerometer on the body reads."""
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import (
-    MOTIONS,
-    Motion,
-    attached,
-    attached_reverse,
-    turned,
-    turned_reverse,
-)
+from torchspline.arithmetic.motion import MOTIONS, Motion, attached, attached_reverse
 from torchspline.arithmetic.so3 import rotate, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate, zero
 from torchspline.fit.residual import Moment, Residual, Slot
-from torchspline.fit.residuals.scaling import IDENTITY, scaled, scaled_reverse
+from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 
 
@@ -28,28 +22,25 @@ class Accelerometer(Residual):
     """
 
     rows, measured_size, derivatives = 3, 3, 2
-    slots = {
-        "bias": Slot(3, None, zero(3)),
+    slots: ClassVar = {
+        **TRIAD,
         "gravity": Slot(3, None, STANDARD_GRAVITY),
-        "rotation": Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0)),
         "lever_arm": Slot(3, None, zero(3)),
-        "scaling": Slot(9, None, IDENTITY),
     }
 
     def _force(
         self, group: GroupArithmetic, at: Moment, given: Mapping[str, Vector]
-    ) -> tuple[Motion, Vector]:
-        """Motion of the body and specific force at the sensor, in the body frame."""
+    ) -> tuple[Motion, Vector, Vector]:
+        """Motion of the body, gravity and the specific force at the sensor, in the body frame."""
         motion = MOTIONS[group.name].motion(at.value, at.rates)
         fall = unrotate(motion.q, given["gravity"])
-        return motion, add(attached(motion, given["lever_arm"]).a, negate(fall))
+        return motion, fall, add(attached(motion, given["lever_arm"]).a, negate(fall))
 
     def evaluate(
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
     ) -> Vector:
-        _, force = self._force(group, at[0], given)
-        seen = turned(given["rotation"], force)
-        return add(scaled(given["scaling"], seen), given["bias"], negate(measured))
+        *_, force = self._force(group, at[0], given)
+        return add(reading(given, force), negate(measured))
 
     def reverse(
         self,
@@ -59,20 +50,11 @@ class Accelerometer(Residual):
         measured: Vector,
         g: Vector,
     ) -> tuple[list[Moment], dict[str, Vector]]:
-        motion, force = self._force(group, at[0], given)
-        seen = turned(given["rotation"], force)
-        scaling_g, seen_g = scaled_reverse(given["scaling"], seen, g)
-        rotation_g, force_g = turned_reverse(given["rotation"], seen, seen_g)
-        motion_g, arm_g = attached_reverse(motion, given["lever_arm"], Motion(a=force_g))
+        motion, fall, force = self._force(group, at[0], given)
+        force_g, cotangents = reading_reverse(given, force, g)
+        motion_g, cotangents["lever_arm"] = attached_reverse(motion, given["lever_arm"], Motion(a=force_g))
         # A body tangent x of q changes R^T gravity by (R^T gravity) x x.
-        fall = unrotate(motion.q, given["gravity"])
         motion_g = motion_g._replace(q=add(motion_g.q, negate(cross(force_g, fall))))
+        cotangents["gravity"] = negate(rotate(motion.q, force_g))
         value_g, rates_g = MOTIONS[group.name].reverse(at[0].value, at[0].rates, motion, motion_g)
-        cotangents = {
-            "bias": g,
-            "gravity": negate(rotate(motion.q, force_g)),
-            "rotation": rotation_g,
-            "lever_arm": arm_g,
-            "scaling": scaling_g,
-        }
         return [Moment(value_g, tuple(rates_g))], cotangents

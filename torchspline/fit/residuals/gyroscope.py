@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 
 from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import MOTIONS, Motion, turned, turned_reverse
-from torchspline.arithmetic.vector import Vector, add, negate, zero
-from torchspline.fit.residual import Moment, Residual, Slot, needs
-from torchspline.fit.residuals.scaling import IDENTITY, scaled, scaled_reverse
+from torchspline.arithmetic.motion import MOTIONS, Motion
+from torchspline.arithmetic.vector import Vector, add, negate
+from torchspline.fit.residual import Moment, Residual, needs
+from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 from torchspline.groups.group import Group
 
 
@@ -19,11 +19,7 @@ class Gyroscope(Residual):
     """
 
     rows, measured_size, derivatives = 3, 3, 1
-    slots = {
-        "bias": Slot(3, None, zero(3)),
-        "rotation": Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0)),
-        "scaling": Slot(9, None, IDENTITY),
-    }
+    slots = TRIAD
 
     @classmethod
     def check_group(cls, group: Group) -> None:
@@ -33,8 +29,7 @@ class Gyroscope(Residual):
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
     ) -> Vector:
         motion = MOTIONS[group.name].motion(at[0].value, at[0].rates)
-        seen = turned(given["rotation"], motion.w)
-        return add(scaled(given["scaling"], seen), given["bias"], negate(measured))
+        return add(reading(given, motion.w), negate(measured))
 
     def reverse(
         self,
@@ -46,8 +41,6 @@ class Gyroscope(Residual):
     ) -> tuple[list[Moment], dict[str, Vector]]:
         mechanics = MOTIONS[group.name]
         motion = mechanics.motion(at[0].value, at[0].rates)
-        seen = turned(given["rotation"], motion.w)
-        scaling_g, seen_g = scaled_reverse(given["scaling"], seen, g)
-        rotation_g, w_g = turned_reverse(given["rotation"], seen, seen_g)
+        w_g, cotangents = reading_reverse(given, motion.w, g)
         value_g, rates_g = mechanics.reverse(at[0].value, at[0].rates, motion, Motion(w=w_g))
-        return [Moment(value_g, tuple(rates_g))], {"bias": g, "rotation": rotation_g, "scaling": scaling_g}
+        return [Moment(value_g, tuple(rates_g))], cotangents

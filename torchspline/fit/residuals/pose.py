@@ -1,6 +1,7 @@
 """A measured pose of the body, or of a sensor on it."""
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS, Motion, attached, attached_reverse
@@ -21,7 +22,7 @@ class Pose(Residual):
 
     rows, measured_size, derivatives = 6, 7, 0
     measured_signs = ((3, 7),)
-    slots = {"T_body_sensor": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))}
+    slots: ClassVar = {"T_body_sensor": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))}
 
     def evaluate(
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector

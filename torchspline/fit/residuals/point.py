@@ -1,0 +1,44 @@
+"""A landmark whose place a sensor measures in three dimensions: depth cameras, lidar, beacons."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
+from torchspline.arithmetic.vector import Vector, add, negate
+from torchspline.fit.residual import Moment, Residual, Slot
+
+
+class Point(Residual):
+    """`T_body_sensor^-1 T_body^-1 landmark - measured`, m, in the frame of the sensor.
+
+    Arguments:
+        landmark: point in the world, m: known, (3,) or (N, 3), or a `Variable`, (3,) or (L, 3) with an index.
+        T_body_sensor: pose of the sensor in the body, SE3.
+    """
+
+    rows, measured_size, derivatives = 3, 3, 0
+    slots: ClassVar = {
+        "landmark": Slot(3, None, None),
+        "T_body_sensor": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+    }
+
+    def evaluate(
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+    ) -> Vector:
+        motion = MOTIONS[group.name].motion(at[0].value, ())
+        return add(sighted(motion, given["T_body_sensor"], given["landmark"]), negate(measured))
+
+    def reverse(
+        self,
+        group: GroupArithmetic,
+        at: Sequence[Moment],
+        given: Mapping[str, Vector],
+        measured: Vector,
+        g: Vector,
+    ) -> tuple[list[Moment], dict[str, Vector]]:
+        mechanics = MOTIONS[group.name]
+        motion = mechanics.motion(at[0].value, ())
+        motion_g, T_g, landmark_g = sighted_reverse(motion, given["T_body_sensor"], given["landmark"], g)
+        value_g, _ = mechanics.reverse(at[0].value, (), motion, motion_g)
+        return [Moment(value_g, ())], {"landmark": landmark_g, "T_body_sensor": T_g}
