@@ -17,6 +17,7 @@ from torchspline import (
     R3,
     SE3,
     SO3,
+    Alignment,
     BSpline,
     HermiteSpline,
     KeyframeSpline,
@@ -87,6 +88,23 @@ def with_pypose(function: Callable[..., Any]) -> Callable[..., Any]:
 def enter_use_kernels(mode: str) -> None:
     with torchspline.use_kernels(mode):
         pass
+
+
+#: A motion, what a gyroscope reads on it, and how the two are aligned.
+TURNING = BSpline(
+    SO3.exp(torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=F64)),
+    group=SO3, dt=1.0, learnable=False,
+)  # fmt: skip
+READ_AT = torch.linspace(0.0, 9.0, 90, dtype=F64)
+with torch.no_grad():
+    GYRO = TURNING.kinematics(READ_AT).angular_velocity
+ALIGNED = Alignment(0.0, 0.0, 4.5, Q[0, 0], None, V[0, 0], None, None, 0.0, None, {}, (90, 0))
+
+
+def align_quickly(**arguments: Any) -> Alignment:
+    """With compiled loops, so that calls that are accepted take no time to speak of."""
+    with torchspline.use_kernels("auto"):
+        return torchspline.align_imu(**arguments)
 
 
 #: Every public function, called by keyword with arguments it accepts.
@@ -178,6 +196,8 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"t": STAMPS, "poses": POSE[0], "group": SE3, "order": 4, "dt": 1.0, "t0": 0.0, "count": 5},
     ),
     "fit_poses": (torchspline.fit_poses, {"t": STAMPS, "poses": POSE[0], "dt": 2.0, "max_iterations": 1}),
+    "align_imu": (align_quickly, {"trajectory": TURNING, "t": READ_AT, "gyro": GYRO, "accel": None}),
+    "Alignment.pose_time": (ALIGNED.pose_time, {"t": READ_AT}),
     "read_poses": (records.read_poses, {"path": TUM_FILE}),
     "read_imu": (records.read_imu, {"path": IMU_FILE}),
     "write_poses": (records.write_poses, {"path": f"{FOLDER.name}/poses.txt", "record": POSES}),

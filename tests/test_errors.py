@@ -71,7 +71,7 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Differentials"}
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Alignment", "Differentials"}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
@@ -134,6 +134,7 @@ _AT_TIMES = (
 _SPLINES = "BSpline SplitBSpline HermiteSpline NonuniformBSpline KeyframeSpline"
 _TIMELESS = f"geodesic_product consistent_signs phantom_points {_SPLINES} Trajectory.mounted Mounted"
 _INSERT = "NonuniformBSpline.insert_knot"
+_ALIGNED = "Alignment.pose_time"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
 _RESIDUALS = " ".join(RESIDUALS)
@@ -155,6 +156,7 @@ NOT_APPLICABLE = {
         f"{_COVARIANCES}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
+        "any shape": _ALIGNED,
     },
     "dtype": {
         "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_INSERT} {_LOSSES} Problem Problem.release Problem.solve "
@@ -162,7 +164,7 @@ NOT_APPLICABLE = {
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
-        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_INSERT} "
+        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_INSERT} {_ALIGNED} "
         "consistent_signs phantom_points",
         "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
         "measurements are copied to the CPU": f"{_RESIDUALS} Variable Clock smoothness Problem.add",
@@ -170,21 +172,21 @@ NOT_APPLICABLE = {
     },
     "nan": {
         "no numbers": f"{_MAKERS} {_NEW} {_WINDOWS} from_scipy",
-        "rows with NaN stay as they are": f"{_FILES} PoseRecord ImuRecord",
+        "rows with NaN stay as they are": f"{_FILES} {_ALIGNED} PoseRecord ImuRecord",
         "checked when the residual was made": "Problem.add",
         "no numbers that can be one": f"Problem.freeze Problem.release {_COVARIANCES}",
     },
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
-        "from_screw from_scipy read_imu write_imu ImuRecord",
-        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} {_INSERT}",
+        f"from_screw from_scipy read_imu write_imu ImuRecord {_ALIGNED}",
+        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} {_INSERT} align_imu",
         "rows stay as they are until they are used": "PoseRecord",
         "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
         "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
         "Result.trajectory_covariance",
     },
     "count": {
-        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_INSERT} measure",
+        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_INSERT} {_ALIGNED} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
         "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
         f"Problem.add Result.trajectory_covariance {_SOLVING}",
@@ -192,7 +194,7 @@ NOT_APPLICABLE = {
     "time": {
         "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} {_TIMELESS}",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
-        "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
+        "any time, also none at all": f"{_FILES} {_WINDOWS} {_ALIGNED} PoseRecord ImuRecord",
         "no trajectory to lie on before Problem.add": f"{_RESIDUALS} {_LOSSES} Variable Clock",
         "times come with residuals": f"smoothness Problem {_SOLVING}",
     },

@@ -1,7 +1,7 @@
 """torchspline: continuous-time motion as a PyTorch layer."""
 
 from torchspline import fit, functional, imu
-from torchspline.fit import PoseFit, fit_poses
+from torchspline.fit import Alignment, PoseFit, align_imu, fit_poses
 from torchspline.groups import R3, SE2, SE3, SO2, SO3, DualQuaternion, Group, Rn, convert, product
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines import (
@@ -27,6 +27,7 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "Alignment",
     "BSpline",
     "Differentials",
     "DualQuaternion",
@@ -40,6 +41,7 @@ __all__ = [
     "SplitBSpline",
     "State",
     "Trajectory",
+    "align_imu",
     "consistent_signs",
     "convert",
     "fit",

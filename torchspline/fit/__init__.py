@@ -1,5 +1,6 @@
 """Trajectories and sensor parameters from measurements."""
 
+from torchspline.fit.align import Alignment, align_imu
 from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
 from torchspline.fit.poses import PoseFit, fit_poses
 from torchspline.fit.problem import Problem
@@ -29,6 +30,7 @@ from torchspline.fit.variables import Variable
 
 __all__ = [
     "Accelerometer",
+    "Alignment",
     "AngularAcceleration",
     "BodyVelocity",
     "Cauchy",
@@ -55,6 +57,7 @@ __all__ = [
     "StateVelocity",
     "Variable",
     "WorldVelocity",
+    "align_imu",
     "fit_poses",
     "smoothness",
 ]

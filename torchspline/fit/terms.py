@@ -31,7 +31,7 @@ class Places(NamedTuple):
     own_u: dict[str, Array]
     outside: Array
     starts: Array
-    #: (runs, moments) and (runs, columns of the rows).
+    #: (runs, moments), or (runs, 0) for a trajectory that stays, and (runs, columns of the rows).
     bases: Array
     columns: Array
     #: Trajectory times (moments, N) and how they move with each unknown of the clock.
@@ -74,6 +74,8 @@ class Term:
             for slot in self.kernel.order
             if isinstance(x := residual.arguments[slot], Variable) and id(x) in model.columns
         ]
+        #: Whether the whole trajectory stays.
+        self.held = not bool((model.columns[id(model.trajectory.module)] >= 0).any())
         self._places: Places | None = None
 
     def __len__(self) -> int:
@@ -109,9 +111,11 @@ class Term:
         keys += self.index.values()
         starts = _runs(keys, len(self))
         first = starts[:-1]
+        # A trajectory that stays as it is has no part in the equations.
+        moving = [] if self.held else base
         columns = [
             self.model.columns[id(trajectory.module)][b[first, None] + np.arange(trajectory.order)]
-            for b in base
+            for b in moving
         ]
         for slot, spline in self.splines.items():
             windows = own_base[slot][first, None] + np.arange(spline.order)
@@ -122,9 +126,12 @@ class Term:
             columns.append(own[rows])
         columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
         blocks = [c.reshape(len(first), math.prod(c.shape[1:])) for c in columns]
+        bases = (
+            np.stack([b[first] for b in moving], axis=1) if moving else np.empty((len(first), 0), np.int64)
+        )
         places = Places(
             base, u, own_base, own_u, np.logical_or.reduce(outside), starts,
-            np.ascontiguousarray(np.stack([b[first] for b in base], axis=1)),
+            np.ascontiguousarray(bases),
             np.ascontiguousarray(np.concatenate(blocks, axis=1)),
             rates,
         )  # fmt: skip
@@ -218,6 +225,8 @@ class Term:
         rows[..., -1] = error
         at = 0
         for g, b, x, parts in zip(moments, base, u, kernel.parts, strict=True):
+            if self.held:
+                break
             spline.local.rows(local, b, x, _apply(weight, g), parts, rows, at)
             at += spline.local.width
         for slot, own in self.splines.items():
