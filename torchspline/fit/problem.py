@@ -191,14 +191,9 @@ class Problem:
         Raises:
             ValueError: nothing to solve, a wrong option, a cost that is not finite.
         """
-        checks.whole("max_iterations", max_iterations, least=0)
-        for name, x in (("cost_tolerance", cost_tolerance), ("gradient_tolerance", gradient_tolerance)):
-            if checks.finite_number(name, x) < 0:
-                raise ValueError(f"{name}: expected a number that is not negative, got {x}")
-        checks.positive("damping", damping)
+        options = Options.checked(max_iterations, cost_tolerance, gradient_tolerance, damping)
         if not self.residuals:
             raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
-        options = Options(max_iterations, cost_tolerance, gradient_tolerance, damping)
         with torch.no_grad(), progress_bar(progress, max_iterations) as show:
             linearizer = self.prepare()
             model = linearizer.model
