@@ -22,6 +22,7 @@ from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
 from torchspline.splines.bspline import BSpline
+from torchspline.splines.local import LocalSpline
 
 Array = NDArray[Any]
 #: Control points that one call may append: more is a time in the wrong unit or of another clock.
@@ -81,13 +82,14 @@ class SlidingWindow:
         clock: dict[str, Any] = {"dt": dt, "t0": t0, "dt_ns": dt_ns, "t0_ns": t0_ns}
         spline = BSpline(start.detach(), group=group, order=order, learnable=False, **clock)
         self.group, self.order = group, order
-        self._t0, end = spline.domain
+        self._t0 = spline.domain[0]
         #: Knot spacing in the unit of the times, and in seconds.
         self._dt: float | int = float(dt) if dt is not None else dt_ns or 0
         self._spacing = self._dt if dt is not None else self._dt * NANOSECOND
         self._segments = max(math.ceil(checks.positive("window", window) / self._spacing - 1e-9), 2)
         sigma = _per_component("smoothness", smoothness, group.tangent_size)
         self._stiffness = 1.0 / (self._spacing * sigma)
+        self._local = LocalSpline(group.name, order, self._spacing, 2)
         #: All control points there are, with room for more, their number, and the first that still moves.
         self._points = group.normalize(start.detach().to("cpu", torch.float64))
         self._count, self._first = len(start), 0
@@ -262,11 +264,10 @@ class SlidingWindow:
                 f"{name}: {t!r} lies {count} control points after the end {end!r}, expected at most {_MOST_AT_ONCE} "
                 "at once; check its unit and its clock"
             )
-        before, last = self._points[self._count - 2 : self._count]
-        step = self.group.log(self.group.between(before, last, validate=False), validate=False)
-        ahead = torch.arange(1, count + 1, dtype=torch.float64)[:, None] * step
-        more = self.group.compose(last, self.group.exp(ahead, validate=False), validate=False)
-        return self.group.normalize(more, validate=False)
+        last = self._points[self._count - 2 : self._count].numpy()
+        step = self._local.at(last).logs[:1]
+        ahead = np.arange(1, count + 1, dtype=np.float64)[:, None] * step
+        return torch.from_numpy(self._local.retract(np.tile(last[1], (count, 1)), ahead))
 
     def _end(self, count: int) -> float | int:
         """Of the domain of `active` with so many control points in all, by the arithmetic of `BSpline.domain`."""
@@ -310,7 +311,7 @@ class SlidingWindow:
         with torch.no_grad():
             problem = Problem(spline)
             for stream in self._streams:
-                problem.add(stream.residual, **stream.index)
+                problem.add(stream.residual, **stream.which)
             for prior in self._priors_on(spline):
                 for part in prior.parts:
                     problem._register(part.unknown)
@@ -363,7 +364,7 @@ class SlidingWindow:
         origin = part.domain[0]
         model = Model([Spline(part, origin)], list(variables.values()), {})
         terms = [
-            Term(s.residual, model, origin, {slot: i.numpy() for slot, i in s.index.items()}) for s, _ in gone
+            Term(s.residual, model, origin, {slot: i.numpy() for slot, i in s.which.items()}) for s, _ in gone
         ]
         bends = Bends(model, self._stiffness, last=excess)
         H, g = normal_equations(

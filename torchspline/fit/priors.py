@@ -10,6 +10,7 @@ from torchspline.fit.model import Model, State
 from torchspline.fit.system import System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
+from torchspline.splines.local import LocalSpline
 
 Array = NDArray[Any]
 
@@ -67,8 +68,11 @@ def _step(part: Part, state: State) -> tuple[Array, Array]:
     """Tangents from the reference to where the unknowns stand (C, D), and their Jacobians (C, D, D)."""
     unknown, reference = part.unknown, part.reference
     if isinstance(unknown, BSpline):
-        now = torch.from_numpy(state.points[id(unknown)][part.points])
-        group = unknown.group
+        # Pairs of a reference and where it stands now, as splines of two points: their logarithms are compiled.
+        pairs = np.stack([reference.numpy(), state.points[id(unknown)][part.points]], axis=1)
+        spline = LocalSpline(unknown.group.name, unknown.order, 1.0, 2)
+        local = spline.at(pairs.reshape(-1, pairs.shape[-1]))
+        return local.logs[::2], spline.pair_jacobians(local)[::2, 1]
     else:
         now = state.values[id(unknown)].reshape(-1, unknown.size)[part.points]
         if unknown.sphere:  # the change of the vector, seen from the basis at the reference

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline.fit.model import NANOSECOND
-from torchspline.fit.residual import Clock, Residual
+from torchspline.fit.residual import Argument, Clock, Residual
 from torchspline.fit.variables import Variable
 
 Array = NDArray[Any]
@@ -22,25 +22,25 @@ class Stream(NamedTuple):
     """A residual bound to a trajectory, and for its arguments of several which one each measurement sees."""
 
     residual: Residual
-    index: dict[str, Tensor]
+    which: dict[str, Tensor]
 
-    def select(self, which: Tensor) -> "Stream":
+    def select(self, chosen: Tensor) -> "Stream":
         """Of some measurements, (N,) bool."""
         old = self.residual
         new = copy.copy(old)
-        new.t, new.measured = old.t[..., which], old.measured[which]
+        new.t, new.measured = old.t[..., chosen], old.measured[chosen]
         if old.clock.late is not None:
-            new.clock = _with_late(old.clock, old.clock.late[which])
-        new.arguments = {slot: x[which] if _own(x) else x for slot, x in old.arguments.items()}
+            new.clock = _with_late(old.clock, old.clock.late[chosen])
+        new.arguments = {slot: _of_each(x, chosen) for slot, x in old.arguments.items()}
         kind, x = old.weighting
         if x is not None and _weighs_each(kind, x):
-            _weigh(new, kind, x[which])
-        return Stream(new, {slot: i[which] for slot, i in self.index.items()})
+            _weigh(new, kind, x[chosen])
+        return Stream(new, {slot: i[chosen] for slot, i in self.which.items()})
 
     def join(self, other: "Stream") -> "Stream | None":
         """Both as one; None if more than the measurements differs."""
         first, second = self.residual, other.residual
-        if type(first) is not type(second) or set(self.index) != set(other.index):
+        if type(first) is not type(second) or set(self.which) != set(other.which):
             return None
         if not _same(_common(first), _common(second)):
             return None
@@ -56,7 +56,7 @@ class Stream(NamedTuple):
             slot: torch.cat([x, second.arguments[slot]]) if _own(x) else x  # type: ignore[list-item]
             for slot, x in first.arguments.items()
         }
-        return Stream(new, {slot: torch.cat([i, other.index[slot]]) for slot, i in self.index.items()})
+        return Stream(new, {slot: torch.cat([i, other.which[slot]]) for slot, i in self.which.items()})
 
 
 def trajectory_times(residual: Residual, origin: float | int) -> Array:
@@ -95,6 +95,10 @@ def _seconds(t: Tensor, origin: float | int) -> Array:
 
 def _with_late(clock: Clock, late: Tensor) -> Clock:
     return Clock(clock.offset, clock.skew, clock.mid, clock.delay, late)
+
+
+def _of_each(x: Argument, chosen: Tensor) -> Argument:
+    return x[chosen] if isinstance(x, Tensor) and _own(x) else x
 
 
 def _own(x: Any) -> bool:
