@@ -55,7 +55,7 @@ class BoundPrior:
         """Add cost and normal equations; the steps' own Jacobians are those of the logarithm."""
         steps, jacobians = [], []
         for part in self.prior.parts:
-            step, jacobian = _step(part, state)
+            step, jacobian = steps_of(part, state)
             steps.append(step.reshape(-1))
             jacobians += list(jacobian)
         x, J = np.concatenate(steps), _block_diagonal(jacobians)
@@ -64,7 +64,7 @@ class BoundPrior:
         system.add_dense(self.columns, J.T @ H @ J, J.T @ (H @ x + g))
 
 
-def _step(part: Part, state: State) -> tuple[Array, Array]:
+def steps_of(part: Part, state: State) -> tuple[Array, Array]:
     """Tangents from the reference to where the unknowns stand (C, D), and their Jacobians (C, D, D)."""
     unknown, reference = part.unknown, part.reference
     if isinstance(unknown, BSpline):
