@@ -383,6 +383,15 @@ def test_an_unknown_time_offset_is_found():
     assert window._first > 30
 
 
+def test_a_skew_needs_a_middle_that_stays():
+    t = torch.tensor([0.1, 0.2], dtype=F64)
+    skew = Variable("skew", torch.zeros(1, dtype=F64))
+    window = SlidingWindow(torch.zeros(3, dtype=F64), group=R3, dt=0.1)
+    with pytest.raises(ValueError, match=r"expected Clock\(mid=...\)"):
+        window.add(StateValue(t, random(2, 3), clock=Clock(skew=skew)))
+    window.add(StateValue(t, random(2, 3), clock=Clock(skew=skew, mid=0.0)))
+
+
 def test_packets_of_one_kind_are_kept_together():
     t = torch.tensor([0.1, 0.2], dtype=F64)
     window = SlidingWindow(torch.zeros(3, dtype=F64), group=R3, dt=0.1)

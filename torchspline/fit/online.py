@@ -174,7 +174,7 @@ class SlidingWindow:
             more = self._beyond("t", last)
         # A problem of its own tells what is wrong before anything changes.
         probe = Problem(self._spline(self._first, self._count, more))
-        probe.know(list(self._variables.values()))
+        probe._know(list(self._variables.values()))
         probe.add(residual, **index)
         self._append(more)
         self._variables.update({v.name: v for v in variables_of(residual)})
@@ -214,7 +214,7 @@ class SlidingWindow:
     ) -> None:
         """Say beforehand how far a variable may be from where it stands now; see `Problem.add_prior`."""
         probe = Problem(self._anchor)
-        probe.know(list(self._variables.values()))
+        probe._know(list(self._variables.values()))
         probe.add_prior(variable, sigma=sigma, covariance=covariance, information=information)
         self._variables[variable.name] = variable
         self._priors += probe._priors
@@ -311,7 +311,7 @@ class SlidingWindow:
             for stream in self._streams:
                 problem.add(stream.residual, **stream.which)
             for prior in self._priors_on(spline):
-                problem.know([part.unknown for part in prior.parts])
+                problem._know([part.unknown for part in prior.parts])
                 problem._priors.append(prior)
             linearizer = problem.prepare()
             linearizer.terms.append(Bends(linearizer.model, self._stiffness))

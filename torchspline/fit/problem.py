@@ -70,12 +70,12 @@ class Problem:
             for x in (*residual.arguments.values(), *residual.clock.unknowns)
             if isinstance(x, (Variable, BSpline))
         ]
-        self.know(unknowns)
+        self._know(unknowns)
         self.residuals.append(residual)
         self._indices.append(indices)
         return residual
 
-    def know(self, unknowns: Sequence[Unknown]) -> None:
+    def _know(self, unknowns: Sequence[Unknown]) -> None:
         """Count these among the unknowns, all or none of them; those of residuals are without being asked."""
         new: list[Unknown] = []
         for x in unknowns:
@@ -136,7 +136,7 @@ class Problem:
         assert root is not None
         root = root.detach().cpu()
         matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
-        self.know([variable])
+        self._know([variable])
         reference = variable.points(variable.value).reshape(count, -1)
         H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
         self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))

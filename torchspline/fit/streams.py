@@ -71,15 +71,21 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
     offset, skew, delay = (
         0.0 if v is None else float(v.value[0]) for v in (clock.offset, clock.skew, clock.delay)
     )
-    mid = float(_seconds(torch.as_tensor(clock.mid), origin))
+    mid = 0.0  # matters to a skew only
+    if clock.skew is not None:
+        if clock.mid is None:
+            raise ValueError(
+                f"clock: the skew of {residual.name} turns about the middle of the trajectory, which moves in a window; "
+                "expected Clock(mid=...)"
+            )
+        mid = float(_seconds(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
     late = 0.0 if clock.late is None else delay * clock.late.detach().cpu().numpy()
     return mid + (t - mid - offset - late) / (1.0 + skew)
 
 
 def clock_unknowns(residual: Residual) -> list[Variable]:
     """What is unknown of the times of a residual."""
-    clock = residual.clock
-    return [v for v in (clock.offset, clock.skew, clock.delay) if v is not None]
+    return list(residual.clock.unknowns)
 
 
 def variables_of(residual: Residual) -> list[Variable]:
