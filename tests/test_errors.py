@@ -6,13 +6,16 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
-from error_cases import CASES
 
 import torchspline
 import torchspline.io as records
+from torchspline.fit import BatchProblem, SlidingWindow
 from torchspline.splines.trajectory import Mounted
+
+CASES = error_online.CASES
 
 
 def label(case: Case) -> str:
@@ -62,7 +65,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
         visit(root)
     return found
 
@@ -146,6 +149,9 @@ NOT_APPLICABLE = {
         "any time, also none at all": f"{_FILES} {_WINDOWS} PoseRecord ImuRecord",
     },
 }
+
+for _category, _reasons in error_online.NOT_APPLICABLE.items():
+    NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}
