@@ -6,16 +6,19 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
-from error_cases import CASES
 
 import torchspline
 import torchspline.io as records
+from torchspline.fit import BatchProblem, SlidingWindow
 from torchspline.fit.losses import Loss
 from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
+
+CASES = error_online.CASES
 
 
 def label(case: Case) -> str:
@@ -65,7 +68,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
         visit(root)
     return found
 
@@ -199,6 +202,9 @@ NOT_APPLICABLE = {
         "times come with residuals": f"smoothness Problem {_SOLVING}",
     },
 }
+
+for _category, _reasons in error_online.NOT_APPLICABLE.items():
+    NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}

@@ -2,6 +2,7 @@
 
 from torchspline.fit.align import Alignment, align_imu
 from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
+from torchspline.fit.online import SlidingWindow
 from torchspline.fit.poses import PoseFit, fit_poses
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Clock, Residual
@@ -26,12 +27,15 @@ from torchspline.fit.residuals import (
 )
 from torchspline.fit.result import Result
 from torchspline.fit.smoothness import smoothness
+from torchspline.fit.together import BatchProblem, BatchResult
 from torchspline.fit.variables import Variable
 
 __all__ = [
     "Accelerometer",
     "Alignment",
     "AngularAcceleration",
+    "BatchProblem",
+    "BatchResult",
     "BodyVelocity",
     "Cauchy",
     "Clock",
@@ -51,6 +55,7 @@ __all__ = [
     "ReprojectionRadtan",
     "Residual",
     "Result",
+    "SlidingWindow",
     "StateAcceleration",
     "StateJerk",
     "StateValue",

@@ -78,6 +78,8 @@ class SlidingWindow:
                 f"start: expected shape ({group.point_size},), a point of {group}, or (M, {group.point_size}), at "
                 f"least {order} control points, got {tuple(start.shape)}"
             )
+        if start.device.type != "cpu":
+            raise ValueError(f"start: expected it on the CPU, got {start.device}; move it with .to('cpu')")
         checks.points("start", start, group, order)
         clock: dict[str, Any] = {"dt": dt, "t0": t0, "dt_ns": dt_ns, "t0_ns": t0_ns}
         spline = BSpline(start.detach(), group=group, order=order, learnable=False, **clock)

@@ -75,8 +75,8 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
     if clock.skew is not None:
         if clock.mid is None:
             raise ValueError(
-                f"clock: the skew of {residual.name} turns about the middle of the trajectory, which moves in a window; "
-                "expected Clock(mid=...)"
+                f"clock: the skew of {residual.name} turns about the middle of the trajectory, which moves in "
+                "a window; expected Clock(mid=...)"
             )
         mid = float(_seconds(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
     late = 0.0 if clock.late is None else delay * clock.late.detach().cpu().numpy()
