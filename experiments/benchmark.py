@@ -2,6 +2,8 @@
 
 Peers are optional, `pip install -c constraints.txt -e '.[bench]'`; what is missing is named and left out. Every
 contender that computes the same thing is compared with the reference before anything is timed.
+
+`benchmark.md` among the results has the tables and the machine; a copy of a quiet run lies beside this file.
 """
 
 import importlib.metadata
@@ -13,7 +15,7 @@ from bench import contenders
 from bench.problems import PEERS
 from bench.sections import SECTIONS, Plan
 from bench.sweeps import Sizes
-from common import Table, run, save, show
+from common import Table, machine, run, save, show, versions
 
 
 def agreement(rows: list[dict[str, Any]]) -> Table:
@@ -78,7 +80,8 @@ def experiment(
         tables.append(
             Table("Who did not take part everywhere", ("",), [[note] for note in sorted(plan.notes)])
         )
-    show(out, tables)
+    peers = {name: version(module) for module, name in PEERS.items()}
+    write_document(out, show(out, tables), peers)
     for name, report in reports.items():
         if report.figure is not None:
             save(report.figure, out / f"{name}.png")
@@ -87,8 +90,25 @@ def experiment(
         **{name: report.record for name, report in reports.items()},
         "section_seconds": seconds,
         "notes": sorted(plan.notes),
-        "peers": {name: version(module) for module, name in PEERS.items()},
+        "peers": peers,
     }
+
+
+def write_document(out: Path, tables: Path, peers: dict[str, str | None]) -> Path:
+    """`benchmark.md`: what ran where, and all tables."""
+    here = machine()
+    known = {**versions(), **peers}
+    software = ", ".join(f"{name} {number}" for name, number in known.items() if number is not None)
+    heading = (
+        "# Benchmark\n\n"
+        "Written by `python experiments/benchmark.py`. All contenders took turns in one process; a contender that "
+        "computes the same thing was compared with the reference first.\n\n"
+        f"Machine: {here['processor']}, {here['usable_cores']} cores, {here['system']} ({here['architecture']}); one "
+        f"thread unless said.\nSoftware: {software}.\n\n"
+    )
+    path = out / "benchmark.md"
+    path.write_text(heading + tables.read_text(encoding="utf-8"), encoding="utf-8")
+    return path
 
 
 def version(module: str) -> str | None:

@@ -218,12 +218,22 @@ def tangents(
     return x.to(dtype)
 
 
+def scale_blocks(group: Group) -> list[tuple[int, int, bool]]:
+    """Component ranges that may be multiplied by any number above zero, and whether by any below it too."""
+    signed = group.arithmetic.sign_blocks
+    inside = [b for b in group.arithmetic.unit_blocks if not any(s[0] <= b[0] < s[1] for s in signed)]
+    return [*((*block, True) for block in signed), *((*block, False) for block in inside)]
+
+
 def rescaled(group: Group, point: Tensor, factors: Sequence[float]) -> Tensor:
-    """The same elements in other numbers: quaternions times `factors`, one after the other along the batch."""
+    """The same elements in other numbers: quaternions times `factors`, one after the other along the batch.
+
+    Where the sign counts, as in [cos, sin], only the size of the factors does.
+    """
     point = point.clone()
     factor = point.new_tensor([factors[i % len(factors)] for i in range(len(point))])[:, None]
-    for start, stop in group.arithmetic.sign_blocks:
-        point[:, start:stop] *= factor
+    for start, stop, signed in scale_blocks(group):
+        point[:, start:stop] *= factor if signed else factor.abs()
     return point
 
 
@@ -234,8 +244,9 @@ def half_turns(group: Group, dtype: torch.dtype = torch.float64) -> Tensor:
     q = torch.cat([axes[:, :1] * 0.0, axes / axes.norm(dim=-1, keepdim=True)], dim=-1)
     q = torch.cat([q, -q])
     turn = group.identity(len(q))
-    for start, _ in group.arithmetic.sign_blocks:
-        turn[:, start : start + 4] = q
+    zeros = 0.0 * q[:, :1]  # of both signs
+    for start, stop in group.arithmetic.unit_blocks:
+        turn[:, start:stop] = q if stop - start == 4 else torch.cat([zeros - 1.0, zeros], dim=-1)
     shift = group.exp(tangents(group, [0.0], each=len(q), seed=9))
     return group.compose(shift, turn).to(dtype)
 
@@ -277,6 +288,7 @@ CASES: dict[str, Case] = {
     "between": Case(Group.between, "PP"),
     "act": Case(Group.act, "PV"),
     "interpolate": Case(Group.interpolate, "PPS"),
+    "power": Case(Group.power, "PS"),
     "retract": Case(Group.retract, "PT"),
     "retract right": Case(lambda g, x, v: g.retract(x, v, side="right"), "PT"),
     "normalize": Case(Group.normalize, "P"),
@@ -292,7 +304,17 @@ CASES: dict[str, Case] = {
 }
 OF_POINTS = [name for name, case in CASES.items() if "P" in case.kinds]
 #: Their results are points, whose sign is free.
-GIVE_POINTS = ("exp", "compose", "inverse", "between", "interpolate", "retract", "retract right", "normalize")
+GIVE_POINTS = (
+    "exp",
+    "compose",
+    "inverse",
+    "between",
+    "interpolate",
+    "power",
+    "retract",
+    "retract right",
+    "normalize",
+)
 
 
 def arguments(group: Group, case: str, angles: Sequence[float], each: int = 1, seed: int = 0) -> list[Tensor]:

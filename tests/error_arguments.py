@@ -13,7 +13,19 @@ from scipy.spatial.transform import Rotation
 
 import torchspline
 import torchspline.io as records
-from torchspline import R3, SE3, SO3, Alignment, BSpline, Rn, SplitBSpline, imu
+from torchspline import (
+    R3,
+    SE3,
+    SO3,
+    Alignment,
+    BSpline,
+    HermiteSpline,
+    KeyframeSpline,
+    NonuniformBSpline,
+    Rn,
+    SplitBSpline,
+    imu,
+)
 from torchspline.groups import convert
 from torchspline.splines.trajectory import Mounted
 
@@ -33,10 +45,25 @@ def file(content: str, name: str) -> str:
 POSE = SE3.random(2, 8, generator=torch.Generator().manual_seed(0))
 TANGENT = torch.full((2, 8, 6), 0.1, dtype=F64)
 Q, V = POSE[..., 3:], POSE[..., :3]
+DUAL = convert.pose_to_dual_quaternion(POSE)
 T = torch.tensor([0.0, 0.2, 0.5], dtype=F64)
 STAMPS = torch.arange(8, dtype=F64)
 NS = torch.arange(3)
 SPLINE = SplitBSpline(POSE, dt=0.1)
+KNOTS = {
+    "values": POSE,
+    "velocities": TANGENT,
+    "accelerations": TANGENT,
+    "group": SE3,
+    "times": torch.linspace(0.0, 0.5, 8, dtype=F64),
+}
+HERMITE = HermiteSpline(**KNOTS)
+KNOTTED = {
+    "control_points": POSE,
+    "group": SE3,
+    "knots": torch.tensor([0.0] * 4 + [0.1, 0.2, 0.3, 0.4] + [0.5] * 4, dtype=F64),
+}
+KEYED = {"keyframes": POSE, "times": KNOTS["times"]}
 SE3_MATRIX, SO3_MATRIX = SE3.to_matrix(POSE), SO3.to_matrix(Q)
 TUM_FILE = file("1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0 0 1\n", "good.txt")
 IMU_FILE = file("1520530308189679351,1,2,3,4,5,6\n", "good.csv")
@@ -106,6 +133,11 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Group.adjoint_act": (SE3.adjoint_act, {"point": POSE, "tangent": TANGENT}),
     "Group.bracket": (SE3.bracket, {"a": TANGENT, "b": TANGENT}),
     "Group.retract": (SE3.retract, {"point": POSE, "tangent": TANGENT, "side": "left"}),
+    "Group.power": (SE3.power, {"point": POSE, "exponent": TANGENT[..., 0]}),
+    "pose_to_dual_quaternion": (convert.pose_to_dual_quaternion, {"pose": POSE}),
+    "pose_from_dual_quaternion": (convert.pose_from_dual_quaternion, {"Q": DUAL}),
+    "to_screw": (convert.to_screw, {"Q": DUAL}),
+    "from_screw": (convert.from_screw, convert.to_screw(DUAL)._asdict()),
     "Group.interpolate": (SE3.interpolate, {"start": POSE, "end": POSE, "s": TANGENT[..., 0]}),
     "to_xyzw": (convert.to_xyzw, {"q": Q}),
     "from_xyzw": (convert.from_xyzw, {"q": Q}),
@@ -139,6 +171,24 @@ ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"T_body_sensor": POSE[0, 0], "t": T, "derivatives": 2},
     ),
     "measure": (imu.measure, {"trajectory": SPLINE, "t": T}),
+    "geodesic_product": (
+        torchspline.functional.geodesic_product,
+        {"start": POSE, "steps": TANGENT[..., None, :], "weights": TANGENT[..., :2, None], "group": SE3},
+    ),
+    "hermite": (torchspline.functional.hermite, {**KNOTS, "t": T, "coordinates": "product", "frame": "body"}),
+    "HermiteSpline": (HermiteSpline, {**KNOTS, "coordinates": "logarithm", "frame": "world"}),
+    "HermiteSpline.evaluate": (HERMITE.evaluate, {"t": T, "derivatives": 2, "frame": "world"}),
+    "HermiteSpline.differentials": (HERMITE.differentials, {"t": T, "side": "left"}),
+    "nonuniform_bspline": (torchspline.functional.nonuniform_bspline, {**KNOTTED, "t": T}),
+    "NonuniformBSpline": (NonuniformBSpline, KNOTTED),
+    "NonuniformBSpline.evaluate": (NonuniformBSpline(**KNOTTED).evaluate, {"t": T, "derivatives": 2}),
+    "NonuniformBSpline.insert_knot": (NonuniformBSpline(**KNOTTED).insert_knot, {"time": 0.25}),
+    "interpolate": (
+        torchspline.functional.interpolate,
+        {"method": "geodesic", **KEYED, "t": T, "group": SE3, "derivatives": 2},
+    ),
+    "KeyframeSpline": (KeyframeSpline, {"method": "geodesic", **KEYED, "group": SE3}),
+    "KeyframeSpline.evaluate": (KeyframeSpline("SE3Up", **KEYED).evaluate, {"t": T, "derivatives": 2}),
     "consistent_signs": (torchspline.consistent_signs, {"points": POSE, "group": SE3}),
     "phantom_points": (torchspline.phantom_points, {"keyframes": POSE, "group": SE3}),
     "initial_control_points": (
@@ -237,8 +287,12 @@ def tensor(
         yield case("mixed dtype", good.float(), "torch.float32", "torch.float64")
 
 
-def times(function: str, scalar: bool = True) -> Iterator[Case]:
-    """What the times of a trajectory with the domain [0, 0.5] are tried with."""
+def times(function: str, points: str = "control_points", ns: bool = True) -> Iterator[Case]:
+    """What the times of a trajectory with the domain [0, 0.5] are tried with.
+
+    Args:
+        points: what it is made of. ns: whether there are trajectories of its kind in nanoseconds.
+    """
 
     def case(category: str, bad: Any, came: str, expected: str) -> Case:
         return refused(function, "t", category, bad, came, expected)
@@ -247,14 +301,14 @@ def times(function: str, scalar: bool = True) -> Iterator[Case]:
     yield case("type", T.numpy(), "got ndarray", "expected a torch.Tensor")
     for dtype in (torch.float16, torch.bfloat16, torch.complex128, torch.int32, torch.bool):
         yield case("dtype", T.to(dtype), f"got {dtype}", "torch.float32 or torch.float64")
-    yield case("dtype", NS, "int64 times", "dt_ns")
+    yield case("dtype", NS, *(("int64 times", "dt_ns") if ns else ("got torch.int64", "torch.float64")))
     yield case("device", T.to("meta"), "meta", "cpu")
-    yield case("batch", T.expand(3, 3), "t (3,)", "control_points (2,)")
+    yield case("batch", T.expand(3, 3), "t (3,)", f"{points} (2,)")
     for value in (NAN, INF, -INF):
         yield case("nan", changed(T, 1, value), f"got {value} at index (1,)", "expected finite numbers")
     yield case("time", T + 0.1, "the first is 0.6", "outside the domain [0.0, 0.5] s")
     yield case("time", T[:1] - 1e-9, "the first is -1e-09", "outside the domain [0.0, 0.5] s")
-    yield case("time", T.float() + 1e6, "near 1e+06 s", "dt = 0.1 s")
+    yield case("time", T.float() + 1e6, "near 1e+06 s", "dt = 0.1 s" if ns else "shortest segment")
 
 
 def spacings(function: str, ns: dict[str, Any]) -> Iterator[Case]:

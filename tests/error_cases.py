@@ -43,7 +43,7 @@ from error_arguments import (
 )
 
 import torchspline.io as records
-from torchspline import SO3, BSpline, Rn, SplitBSpline
+from torchspline import SE3, SO3, BSpline, Rn, SplitBSpline
 from torchspline.fit.losses import Huber
 from torchspline.groups import convert
 
@@ -70,12 +70,13 @@ def cases() -> Iterator[Case]:
             yield refused(function, "dtype", "dtype", bad, f"got {bad}", "torch.float32 or torch.float64")
     yield refused("Group.random", "generator", "type", 5, "got int", "expected a torch.Generator")
 
-    quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0}
+    quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0, "Q": 0}
     for function, (_, good) in ACCEPTED.items():
         if function in error_fit.FITTING:
             continue
         if not function.startswith("Group.") and good.keys() & {
             "t",
+            "times",
             "control_points",
             "keyframes",
             "points",
@@ -84,13 +85,18 @@ def cases() -> Iterator[Case]:
             continue  # sequences and records come below
         together = [name for name, x in good.items() if isinstance(x, torch.Tensor)]
         for name in together:
-            if name in ("s", "matrix", "T_body_sensor"):
+            if name in ("s", "exponent", "matrix", "T_body_sensor") or function in (
+                "from_screw",
+                "geodesic_product",
+            ):
                 continue
             start = quaternions.get(name)
             width = good[name].shape[-1]
             part = None if start is None else slice(start, width)
             if function == "pose_from_xyzw":
                 part = slice(3, 7)
+            if name == "Q":
+                part = slice(0, 4)
             others = [other for other in together if other != name]
             yield from tensor(function, name, f" (..., {width})", part, others[0] if others else None)
             if others:
@@ -103,18 +109,22 @@ def cases() -> Iterator[Case]:
             yield refused(function, "matrix", "option", bad, "is off by", "expected matrices of the group")
     for bad in ("Left", None, 1):
         yield refused("Group.retract", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
-    s = TANGENT[..., 0]
-    for bad in (None, "a", [0.5], 1j, True):
-        yield refused("Group.interpolate", "s", "type", bad, f"got {type(bad).__name__}", "expected a number")
-    for bad in (s.to(I64), s.half()):
-        yield refused("Group.interpolate", "s", "dtype", bad, f"got {bad.dtype}", "torch.float64")
-    for bad in (NAN, s * INF):
-        yield refused(
-            "Group.interpolate", "s", "nan", bad, f"got {'inf' if bad is not NAN else 'nan'}", "finite"
-        )
-    yield refused("Group.interpolate", "s", "batch", s[..., :3], "s (2, 3)", "start (2, 8)")
-    yield refused("Group.interpolate", "s", "device", s.to("meta"), "meta", "cpu")
-    yield refused("Group.interpolate", "s", "mixed dtype", s.float(), "torch.float32", "torch.float64")
+    for function, name, start in (
+        ("Group.interpolate", "s", "start"),
+        ("Group.power", "exponent", "point"),
+    ):
+        s = TANGENT[..., 0]
+        for bad in (None, "a", [0.5], 1j, True):
+            yield refused(function, name, "type", bad, f"got {type(bad).__name__}", "expected a number")
+        for bad in (s.to(I64), s.half()):
+            yield refused(function, name, "dtype", bad, f"got {bad.dtype}", "torch.float64")
+        for bad in (NAN, s * INF):
+            came = f"got {'inf' if bad is not NAN else 'nan'}"
+            yield refused(function, name, "nan", bad, came, "finite")
+        yield refused(function, name, "batch", s[..., :3], f"{name} (2, 3)", f"{start} (2, 8)")
+        yield refused(function, name, "device", s.to("meta"), "meta", "cpu")
+        yield refused(function, name, "mixed dtype", s.float(), "torch.float32", "torch.float64")
+    yield from screws()
     for function in ("to_euler", "from_euler"):
         for bad in ("xxz", "XYz", "xy", "", None, 5):
             yield refused(function, "sequence", "option", bad, f"got {bad!r}", "one of 'XYX'")
@@ -193,6 +203,10 @@ def cases() -> Iterator[Case]:
         yield refused("measure", name, "shape", (0.0, 9.8), "got (2,)", "expected shape (..., 3)")
         yield refused("measure", name, "batch", V[0, :4], f"{name} (4, 3)", "readings (2, 3, 3)")
 
+    yield from geodesics()
+    yield from hermite()
+    yield from nonuniform()
+    yield from keyframes()
     yield from control_points("consistent_signs", "points", POSE, 1)
     yield from control_points("phantom_points", "keyframes", POSE, 2)
     yield refused("phantom_points", "keyframes", "count", POSE[:, :2], "got 2", "at least 3 points", order=6)
@@ -214,6 +228,135 @@ def cases() -> Iterator[Case]:
     yield from alignments()
     yield from files()
     yield from error_fit.cases()
+
+
+def knot_times(function: str, argument: str, what: str) -> Iterator[Case]:
+    """What the times of knots or keys are tried with; eight are expected."""
+    good = ACCEPTED[function][1][argument]
+    for case in tensor(function, argument, " (8,), one time for each", mixed=None, like=good):
+        if case.category != "shape":
+            yield case
+    for bad in (good[:-1], good[None], good[0]):
+        yield refused(function, argument, "shape", bad, f"got {tuple(bad.shape)}", "expected shape (8,)")
+    yield refused(function, argument, "option", good.flip(0), "and then", "increasing times")
+    yield refused(function, argument, "option", 0 * good, "got 0.0 and then 0.0", "drop duplicates")
+    yield refused(function, argument, "device", good.to("meta"), "meta", "cpu")
+
+
+def geodesics() -> Iterator[Case]:
+    function = "geodesic_product"
+    good = ACCEPTED[function][1]
+    yield from tensor(function, "start", " (..., 7)", slice(3, 7), "steps")
+    for name, size in (("steps", " (..., n, 6)"), ("weights", " (..., R + 1, 1)")):
+        yield from tensor(function, name, size, None, "start")
+        yield refused(function, name, "batch", good[name][:, :3], f"{name} (2, 3)", "start (2, 8)")
+    none, five = good["steps"][..., :0, :], TANGENT[..., :5, None]
+    yield refused(function, "steps", "count", none, "got (2, 8, 0, 6)", "n tangents")
+    yield refused(function, "weights", "count", five, "got (2, 8, 5, 1)", "from 0 to 3 derivatives")
+    yield from groups(function)
+
+
+def hermite() -> Iterator[Case]:
+    for function in ("hermite", "HermiteSpline"):
+        yield from control_points(function, "values", POSE, 2)
+        for name in ("velocities", "accelerations"):
+            yield from tensor(function, name, " (2, 8, 6), tangents of", None, "values")
+            yield refused(
+                function, name, "shape", TANGENT[:, :7], "got (2, 7, 6)", "expected shape (2, 8, 6)"
+            )
+        yield from knot_times(function, "times", "knots")
+        yield from groups(function)
+        for name, options in (("coordinates", "'product', 'logarithm'"), ("frame", "'body', 'world'")):
+            for bad in ("Body", "", None, True):
+                yield refused(function, name, "option", bad, f"got {bad!r}", options)
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+    for function in ("hermite", "HermiteSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+    for function in ("hermite", "HermiteSpline.evaluate", "HermiteSpline.differentials"):
+        yield from times(function, "values", ns=False)
+    for bad in ("Body", None):
+        yield refused("HermiteSpline.evaluate", "frame", "option", bad, f"got {bad!r}", "'body', 'world'")
+        yield refused("HermiteSpline.differentials", "side", "option", bad, f"got {bad!r}", "'left', 'right'")
+
+
+def nonuniform() -> Iterator[Case]:
+    for function in ("nonuniform_bspline", "NonuniformBSpline"):
+        yield from control_points(function, "control_points", POSE, 4)
+        yield from wholes(function, "order", 2, 3.5, INF)
+        yield from groups(function)
+        knots = ACCEPTED[function][1]["knots"]
+        for case in tensor(function, "knots", "", mixed="control_points", like=knots):
+            if case.category not in ("shape", "mixed dtype"):  # float32 knots are numbers like any other
+                yield case
+        for bad in (knots[:-1], knots[None], knots[0]):
+            yield refused(function, "knots", "shape", bad, f"got {tuple(bad.shape)}", "expected shape (12,)")
+        yield refused(function, "knots", "option", knots.flip(0), "and then", "do not decrease")
+        yield refused(function, "knots", "option", 0 * knots, "got 0.0 to 0.0", "a domain of some duration")
+        often = changed(knots, slice(3, 8), 0.3)
+        yield refused(function, "knots", "option", often, "got 0.3", "at most 4 times")
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+    for function in ("nonuniform_bspline", "NonuniformBSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+        yield from times(function, "control_points", ns=False)
+    function = "NonuniformBSpline.insert_knot"
+    yield from numbers(function, "time")
+    yield refused(function, "time", "time", 0.6, "got 0.6", "inside the domain [0.0, 0.5] s")
+    yield refused(function, "time", "option", 0.0, "got 0.0", "less than 3 times")
+
+
+def keyframes() -> Iterator[Case]:
+    for function in ("interpolate", "KeyframeSpline"):
+        yield from control_points(function, "keyframes", POSE, 2)
+        yield from knot_times(function, "times", "keyframes")
+        for bad in ("spline", "", None, 5):
+            yield refused(function, "method", "option", bad, f"got {bad!r}", "one of LERP, Bezier")
+        for bad in ("SE3", SE3.arithmetic):
+            yield refused(
+                function, "group", "type", bad, f"got {type(bad).__name__}", "expected a torchspline.Group"
+            )
+        yield refused(function, "group", "option", None, "got None", "such as torchspline.SE3")
+        yield refused(function, "group", "option", SE3, "got SE3", "none or R3xSO3", method="SPLIT")
+        for bad in ("Short", "", None, True):
+            yield refused(function, "way", "option", bad, f"got {bad!r}", "'short', 'signs'")
+        for bad in ("Clamp", "", None, True):
+            yield refused(
+                function, "extrapolate", "option", bad, f"got {bad!r}", "'error', 'clamp', 'linear'"
+            )
+        yield refused(function, "ends", "option", "natural", "got ends", "it has none")
+        for bad in ("Natural", None):
+            wrong = {"method": "composite_bezier", "ends": bad}
+            yield refused(function, "ends", "option", bad, f"got {bad!r}", "'natural', 'clamped'", **wrong)
+        two = {"keyframes": POSE[:, :2], "times": STAMPS[:2]}
+        yield refused(
+            function, "keyframes", "count", two["keyframes"], "got 2", "at least 3 ",
+            method="squad", times=two["times"],
+        )  # fmt: skip
+    for function in ("interpolate", "KeyframeSpline.evaluate"):
+        for bad in (4, -1, True, 1.0, None):
+            yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+        yield from times(function, "keyframes", ns=False)
+
+
+def screws() -> Iterator[Case]:
+    function = "from_screw"
+    good = ACCEPTED[function][1]
+    for name, x in good.items():
+        if name in ("axis", "moment"):
+            yield from tensor(function, name, " (..., 3)", None, "angle" if name == "axis" else "axis")
+        else:
+            for case in tensor(function, name, "", None, "axis"):
+                if case.category != "shape":
+                    yield case
+        yield refused(function, name, "batch", x[:1, :3], f"{name} (1, 3)", "(2, 8)")
+    yield refused(function, "axis", "option", 2 * good["axis"], "got length 2", "length one")
 
 
 def fits() -> Iterator[Case]:

@@ -377,3 +377,4 @@ def problems() -> Iterator[Case]:
     for name in ("cost_tolerance", "gradient_tolerance"):
         yield from numbers(function, name, -1.0)
     yield from numbers(function, "damping", 0.0, -math.pi)
+    yield refused(function, "differentiable", "option", True, "none of the measurements", "requires grad")

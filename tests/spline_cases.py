@@ -1,7 +1,7 @@
 """Control points for the tests of splines: ordinary ones, and those that splines of other libraries stumble over."""
 
 import torch
-from batteries import LENGTHS, PI, generator, half_turns, normal, rescaled, tangents
+from batteries import LENGTHS, PI, generator, half_turns, normal, rescaled, scale_blocks, tangents
 from torch import Tensor
 
 from torchspline.functional import bspline
@@ -63,7 +63,7 @@ def exactly_pi_apart(group: Group, count: int) -> Tensor:
 def sizes(group: Group, points: Tensor) -> Tensor:
     """The lengths of quaternions at their components, ones elsewhere: the scale on which points may move."""
     scale = torch.ones_like(points)
-    for start, stop in group.arithmetic.sign_blocks:
+    for start, stop, _ in scale_blocks(group):
         scale[..., start:stop] = points[..., start:stop].norm(dim=-1, keepdim=True)
     return scale
 

@@ -93,6 +93,13 @@ def test_kernels_show_prints_a_loop() -> None:
     assert "real = np.float32" in done.stdout
 
 
+def test_kernels_show_prints_a_triton_kernel() -> None:
+    done = torchspline("kernels", "show", "SO3", "--order", "2", "--target", "triton")
+    assert done.returncode == 0, done.stderr
+    compile(done.stdout, "shown", "exec")
+    assert "@triton.jit\ndef forward_SO3_k2_d2_float64(" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

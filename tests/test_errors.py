@@ -71,7 +71,7 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Alignment"}
+RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Alignment", "Differentials"}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
@@ -101,7 +101,7 @@ FREE = {
     "device": "goes straight to PyTorch, which lists the devices there are",
     "source": "goes into messages as it is",
     "name": "goes into messages as it is",
-    "options": "those of BSpline, tried one by one",
+    "options": "those of BSpline or of a scheme, tried one by one",
     "arguments": "those of the residual, tried one by one",
     "index": "for arguments of the residual, tried with one",
 }
@@ -112,18 +112,28 @@ _GROUP_TANGENT = (
     "Group.right_jacobian Group.right_jacobian_inverse"
 )
 _GROUP_POINT = "Group.adjoint Group.inverse Group.log Group.normalize Group.to_matrix"
+_WEIGHTED = "Group.power Group.interpolate from_screw"
 _GROUP_TWO = (
-    "Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.interpolate Group.bracket"
+    f"{_WEIGHTED} Group.compose Group.between Group.act Group.adjoint_act Group.retract Group.bracket"
 )
 _MATRIX = "Group.from_matrix from_rotation_matrix from_transform_matrix from_transform3d"
 _VECTOR = "from_rotation_vector from_euler"
+_DUAL = "pose_to_dual_quaternion pose_from_dual_quaternion to_screw"
 _QUATERNION = (
     "to_xyzw from_xyzw pose_to_xyzw pose_from_xyzw to_rotation_matrix to_rotation_vector to_transform_matrix "
     "to_euler to_scipy to_pypose from_pypose to_transform3d"
 )
-_POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} from_scipy"
+_POINTWISE = f"{_GROUP_TANGENT} {_GROUP_POINT} {_MATRIX} {_VECTOR} {_QUATERNION} {_DUAL} from_scipy"
 _NEW = "Group.identity Group.random"
-_AT_TIMES = "BSpline.evaluate BSpline.jacobians Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+_HERMITE = (
+    "HermiteSpline.evaluate HermiteSpline.differentials NonuniformBSpline.evaluate KeyframeSpline.evaluate"
+)
+_AT_TIMES = (
+    f"{_HERMITE} BSpline.evaluate BSpline.jacobians Trajectory.forward Trajectory.kinematics Mounted.evaluate"
+)
+_SPLINES = "BSpline SplitBSpline HermiteSpline NonuniformBSpline KeyframeSpline"
+_TIMELESS = f"geodesic_product consistent_signs phantom_points {_SPLINES} Trajectory.mounted Mounted"
+_INSERT = "NonuniformBSpline.insert_knot"
 _ALIGNED = "Alignment.pose_time"
 _FILES = "read_poses read_imu write_poses write_imu"
 _WINDOWS = "_Record.seconds _Record.window"
@@ -142,19 +152,20 @@ _SOLVING = f"Problem.add_prior Problem.freeze Problem.release Problem.solve {_CO
 #: Where a kind of mistake cannot be made: category -> reason -> functions.
 NOT_APPLICABLE = {
     "shape": {
-        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_LOSSES} Problem.release Problem.solve {_COVARIANCES}",
+        "no tensor": f"{_MAKERS} from_scipy {_WINDOWS} {_INSERT} {_LOSSES} Problem.release Problem.solve "
+        f"{_COVARIANCES}",
         "a foreign object or a record, whose shape is its own affair": "from_pypose from_transform3d "
         "write_poses write_imu",
         "any shape": _ALIGNED,
     },
     "dtype": {
-        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_LOSSES} Problem Problem.release Problem.solve "
+        "no tensor": f"{_MAKERS} {_FILES} {_WINDOWS} {_INSERT} {_LOSSES} Problem Problem.release Problem.solve "
         f"{_COVARIANCES}",
         "a foreign object with a dtype of its own": "from_pypose from_transform3d",
     },
     "device": {
-        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_ALIGNED} consistent_signs "
-        "phantom_points",
+        "no two tensors": f"{_MAKERS} {_NEW} {_POINTWISE} {_FILES} {_WINDOWS} {_INSERT} {_ALIGNED} "
+        "consistent_signs phantom_points",
         "the mount waits for the first call, and is refused there": "Trajectory.mounted Mounted",
         "measurements are copied to the CPU": f"{_RESIDUALS} Variable Clock smoothness Problem.add",
         "no tensor that stays": f"{_LOSSES} {_SOLVING}",
@@ -167,22 +178,21 @@ NOT_APPLICABLE = {
     },
     "zero quaternion": {
         "no quaternion goes in": f"{_MAKERS} {_NEW} {_MATRIX} {_GROUP_TANGENT} {_VECTOR} {_WINDOWS} Group.bracket "
-        f"from_scipy read_imu write_imu ImuRecord {_ALIGNED}",
-        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} align_imu",
+        f"from_screw from_scipy read_imu write_imu ImuRecord {_ALIGNED}",
+        "control points and mount were checked when the trajectory was made": f"{_AT_TIMES} {_INSERT} align_imu",
         "rows stay as they are until they are used": "PoseRecord",
         "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
         "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
         "Result.trajectory_covariance",
     },
     "count": {
-        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_ALIGNED} measure",
+        "any number of points": f"{_NEW} {_POINTWISE} {_GROUP_TWO} {_AT_TIMES} {_WINDOWS} {_INSERT} {_ALIGNED} measure",
         "one of it": "Group Rn use_kernels Trajectory.mounted Mounted",
         "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
         f"Problem.add Result.trajectory_covariance {_SOLVING}",
     },
     "time": {
-        "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} consistent_signs phantom_points BSpline "
-        "SplitBSpline Trajectory.mounted Mounted",
+        "no times": f"{_MAKERS} {_NEW} {_POINTWISE} {_GROUP_TWO} {_TIMELESS}",
         "no domain before there is a trajectory": "initial_control_points fit_poses",
         "any time, also none at all": f"{_FILES} {_WINDOWS} {_ALIGNED} PoseRecord ImuRecord",
         "no trajectory to lie on before Problem.add": f"{_RESIDUALS} {_LOSSES} Variable Clock",

@@ -45,6 +45,11 @@ def test_experiment_runs(path, tmp_path):
     assert {"processor", "cores"} <= set(results["machine"])
     assert results["wall_time_s"] > 0
 
+    if path.stem == "benchmark":  # what the README links to
+        document = (tmp_path / "benchmark.md").read_text(encoding="utf-8")
+        assert f"Machine: {results['machine']['processor']}" in document
+        assert (tmp_path / "table.md").read_text(encoding="utf-8") in document
+
     plots = list(tmp_path.glob("*.png"))
     assert plots
     assert all(plot.read_bytes().startswith(PNG_SIGNATURE) for plot in plots)

@@ -34,7 +34,7 @@ def test_matrices_form_the_same_group(group, dtype):
     assert error(group.to_matrix(group.compose(X, Y)), MX @ MY, 2) < 20
     assert error(group.to_matrix(group.inverse(X)), MX.inverse(), 2) < 20
     assert error(group.to_matrix(group.between(X, Y)), torch.linalg.solve(MX, MY), 2) < 20
-    assert error(group.to_matrix(group.normalize(X)), MX, 2) < 5
+    assert error(group.to_matrix(group.normalize(X)), MX, 2) < 6
     assert equal_up_to_sign(group, group.from_matrix(group.to_matrix(X)), group.normalize(X)) < 5
 
 
@@ -342,7 +342,7 @@ def test_random_is_seeded_and_normalised(group, dtype):
     assert first.shape == (500, 2, group.point_size)
     assert torch.equal(first, second)
     assert not torch.equal(first, group.random(500, 2, dtype=dtype))
-    assert error(group.normalize(first), first) < 2
+    assert error(group.normalize(first), first) < 3
     # Half of all rotations turn by more than 2.31 rad: uniform on the rotations, not on the angles.
     for block in kit.rotation_blocks(group.name):
         if len(block) == 3:

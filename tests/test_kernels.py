@@ -13,6 +13,7 @@ import torchspline
 from torchspline import BSpline
 from torchspline.functional import bspline
 from torchspline.groups import R3, SE3, SO3, Group
+from torchspline.kernels.spline import SplineKernels
 
 pytest.importorskip("numba")
 
@@ -31,10 +32,15 @@ SOME = [
     (Group("R3xSO3"), 2, float64, 2, False),
     (SE3, 3, float64, 2, False),
 ]
-_FEW = {"R1": (2, 5), "R3": (4, 8), "R3xSO3": (3, 4, 6), "SO3xSE3": (2, 4)}
+#: All orders on the two groups that most people use, few on the others: compiling takes seconds each.
+_ORDERS = {
+    **dict.fromkeys((g.name for g in FIXED), (2, 4)),
+    **{"SO3": range(2, 9), "SE3": range(2, 9)},
+    **{"R1": (2, 5), "R3": (4, 8), "R3xSO3": (3, 4, 6), "SO3xSE3": (2, 4)},
+}
 EVERY = [
-    (group, order, dtype, 2, False)
-    for group, orders in (*((g, range(2, 9)) for g in FIXED), *((Group(g), k) for g, k in _FEW.items()))
+    (Group(name), order, dtype, 2, False)
+    for name, orders in _ORDERS.items()
     for order in orders
     for dtype in (float64, float32)
 ]
@@ -258,7 +264,6 @@ TRANSFORMS = {
     "jvp": lambda f, x: torch.func.jvp(f, (x,), (x.cos(),))[1],
     "vjp": lambda f, x: torch.func.vjp(f, x)[1](normal(2, 3, 10, seed=0))[0],
     "forward mode": lambda f, x: forward_mode(f, x),
-    "compile": lambda f, x: torch.compile(f, fullgraph=True, backend="aot_eager")(x),
 }
 
 
@@ -279,10 +284,73 @@ def test_transforms_use_the_reference(transform):
             return TRANSFORMS[transform](function, points)
 
     assert torch.equal(result("auto"), result("reference"))
+    with pytest.raises(RuntimeError, match="no kernel serves this call"):
+        result("fused")
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Names of the kernels that are used."""
+    names = []
+    for kind in ("forward", "reverse"):
+        method = getattr(SplineKernels, kind)
+        monkeypatch.setattr(
+            SplineKernels,
+            kind,
+            lambda self, *a, kind=kind, method=method: (
+                names.append((kind, self.nanoseconds)),
+                method(self, *a),
+            )[1],
+        )
+    return names
+
+
+@pytest.mark.parametrize("clock", ["seconds", "nanoseconds"])
+@pytest.mark.parametrize("extrapolate", ["error", "linear"])
+def test_compiled_graphs_use_kernels(launched, clock, extrapolate):
+    """Their operators do, at places in segments, and agree with eager calls."""
+    points, t, dt, t0 = (
+        x.detach().requires_grad_() for x in (stack(2), spread(4, 40), number(DT), number(T0))
+    )
+    options, wanted = {"dt": dt, "t0": t0}, (points, t, dt, t0)
+    if clock == "nanoseconds":
+        options, wanted, t = NANOSECONDS, (points,), spread(4, 40, ns=True)
+    if extrapolate == "linear":
+        t = (t + (t - t.min())).detach().requires_grad_(clock == "seconds")
+        wanted = wanted if clock == "nanoseconds" else (points, t, dt, t0)
+
+    def function(points, t):
+        return torch.cat(bspline(points, t, extrapolate=extrapolate, **options, **CUBIC)[:3], dim=-1)
+
+    def outcome(function):
+        result = function(points, t)
+        return result, *torch.autograd.grad(result, wanted, normal(*result.shape, seed=0))
+
     torch.compiler.reset()
-    if transform != "compile":  # which cannot see the mode
-        with pytest.raises(RuntimeError, match="no kernel serves this call"):
-            result("fused")
+    with torchspline.use_kernels("fused"):
+        ours = outcome(torch.compile(function, fullgraph=True, backend="aot_eager"))
+    assert ("reverse", None) in launched
+    launched.clear()
+    with torchspline.use_kernels("reference"):
+        theirs = outcome(torch.compile(function, fullgraph=True, backend="aot_eager"))
+        eager = outcome(function)
+    assert not launched
+    assert all(map(torch.allclose, ours, theirs, [1e-13] * 5, [1e-13] * 5))
+    assert all(map(torch.allclose, ours, eager, [1e-13] * 5, [1e-13] * 5))
+
+
+@pytest.mark.parametrize(
+    ("group", "order", "dtype"),
+    [(SO3, 4, float64), pytest.param(SE3, 5, float32, marks=pytest.mark.slow)],
+    ids=str,
+)
+def test_places_equal_the_reference(launched, group, order, dtype):
+    """Times outside are served by the kernels that take places; sums over chunks, shared times and each its own."""
+    points = torch.stack([control_points(group, 9, seed=i) for i in range(2)]).to(dtype)
+    for t in (spread(9 - order + 1, 40_000), spread(9 - order + 1, 2, 17), spread(9 - order + 1, 2, 20_000)):
+        t.view(-1)[:2] = torch.tensor([T0 - 1.0, T0 + 7.0])
+        assert_same(points, t, group=group, order=order, extrapolate="linear", learnt=["control_points", "t"])
+    assert {("forward", None), ("reverse", None)} <= set(launched)
 
 
 WRONG = (float("nan"), float("inf"), -float("inf"), T0 - 1e-3 * DT, T0 + 4.001 * DT, 1e300)

@@ -8,12 +8,12 @@ from batteries import GROUPS, hat, normal
 from spline_cases import close, control_points
 
 from torchspline import BSpline, SplitBSpline
-from torchspline.groups import R3, SE3, SO3, product
+from torchspline.groups import R3, SE3, SO3, DualQuaternion, convert, product
 
 float64 = torch.float64
 SPLIT = product(R3, SO3)
-MOVING = (SO3, R3, SPLIT, SE3)
-BODIES = (SO3, SPLIT, SE3)
+MOVING = (SO3, R3, SPLIT, SE3, DualQuaternion)
+BODIES = (SO3, SPLIT, SE3, DualQuaternion)
 each_moving = pytest.mark.parametrize("group", MOVING, ids=str)
 each_body = pytest.mark.parametrize("group", BODIES, ids=str)
 TIMES = torch.tensor([0.31, 1.07, 2.44], dtype=float64)
@@ -181,7 +181,7 @@ def test_mounted_against_composition(group):
 def test_mounted_body_rates_are_those_of_the_product(group):
     """Nested differentiation of the composed pose, independent of the transport formulas."""
     spline, T = trajectory(group), poses()[1]
-    part = T[3:] if group is SO3 else T
+    part = {SO3: T[3:], DualQuaternion: convert.pose_to_dual_quaternion(T)}.get(group, T)
     mounted = spline.mounted(T).evaluate(TIMES, 3)
 
     def matrix(t):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from numbers import Real
+from operator import attrgetter
 from typing import Any, Protocol
 
 import torch
@@ -21,6 +22,7 @@ class HasPoints(Protocol):
 
 #: Quaternions may have any length in this range; beyond it their squares leave the range of float32.
 SHORTEST_QUATERNION, LONGEST_QUATERNION = 1e-15, 1e15
+_is_cpu = attrgetter("is_cpu")
 
 
 def is_floating_tensor(name: str, x: object) -> Tensor:
@@ -67,9 +69,7 @@ def broadcast(**shapes: Sequence[int]) -> torch.Size:
 
 def values_visible(*tensors: Tensor) -> bool:
     """Whether looking at values is possible and free of a device round trip: eager code on the CPU."""
-    if torch.compiler.is_compiling():
-        return False
-    return all(x.device.type == "cpu" for x in tensors)
+    return not torch.compiler.is_compiling() and all(map(_is_cpu, tensors))
 
 
 def finite(name: str, x: Tensor) -> None:
@@ -85,7 +85,7 @@ def finite(name: str, x: Tensor) -> None:
 
 
 def quaternions(name: str, x: Tensor, blocks: Sequence[tuple[int, int]]) -> None:
-    """Every quaternion in the component ranges `blocks` has a length that can be divided by."""
+    """Every quaternion (or [cos, sin]) in the component ranges `blocks` has a length that can be divided by."""
     if not values_visible(x) or x.numel() == 0:
         return
     for start, stop in blocks:
@@ -94,15 +94,20 @@ def quaternions(name: str, x: Tensor, blocks: Sequence[tuple[int, int]]) -> None
         if _truth(good.all()):
             continue
         where = tuple(torch.nonzero(~good)[0].tolist())
+        what = "quaternions" if stop - start == 4 else "pairs [cos, sin]"
         raise ValueError(
-            f"{name}: expected quaternions (components {start} to {stop - 1}) of a length between "
+            f"{name}: expected {what} (components {start} to {stop - 1}) of a length between "
             f"{SHORTEST_QUATERNION:g} and {LONGEST_QUATERNION:g}, got length {length[where].item():g} "
             f"at index {where}"
         )
 
 
-def points(name: str, x: Tensor, group: "HasPoints", least: int) -> None:
-    """A sequence `(*batch, M, P)` of at least `least` points of `group`, finite, with usable quaternions."""
+def points(name: str, x: Tensor, group: "HasPoints", least: int, look: bool = True) -> None:
+    """A sequence `(*batch, M, P)` of at least `least` points of `group`, finite, with usable quaternions.
+
+    Args:
+        look: whether to look at values.
+    """
     is_floating_tensor(name, x)
     if x.ndim < 2 or x.shape[-1] != group.point_size:
         raise ValueError(
@@ -110,8 +115,24 @@ def points(name: str, x: Tensor, group: "HasPoints", least: int) -> None:
         )
     if x.shape[-2] < least:
         raise ValueError(f"{name}: expected at least {least} points of {group}, got {x.shape[-2]}")
+    if not look:
+        return
     finite(name, x)
-    quaternions(name, x, group.arithmetic.sign_blocks)
+    quaternions(name, x, group.arithmetic.unit_blocks)
+
+
+def unit_length(name: str, x: Tensor, tolerance: float) -> None:
+    """Every vector along the last dimension has length one up to `tolerance`."""
+    if not values_visible(x) or x.numel() == 0:
+        return
+    length = x.detach().norm(dim=-1)
+    good = (length - 1.0).abs() <= tolerance
+    if _truth(good.all()):
+        return
+    where = tuple(torch.nonzero(~good)[0].tolist())
+    raise ValueError(
+        f"{name}: expected vectors of length one, got length {length[where].item():g} at index {where}"
+    )
 
 
 def close_matrices(name: str, x: Tensor, valid: Tensor, tolerance: float) -> None:
@@ -133,7 +154,7 @@ def point(name: str, x: Tensor, group: "HasPoints", meaning: str) -> None:
     is_floating_tensor(name, x)
     has_last(name, x, group.point_size, meaning)
     finite(name, x)
-    quaternions(name, x, group.arithmetic.sign_blocks)
+    quaternions(name, x, group.arithmetic.unit_blocks)
 
 
 def instance(name: str, x: object, kind: type, meaning: str) -> None:

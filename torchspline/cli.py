@@ -18,7 +18,7 @@ from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline, Trajectory
-from torchspline.splines.fused import kernels_of
+from torchspline.splines.fused import kernels_of, triton_kernels_of
 
 _NS = 1_000_000_000
 _console = Console()
@@ -208,6 +208,7 @@ def show(
     derivatives: Literal[0, 1, 2, 3] = 2,
     sweep: Literal["forward", "reverse"] = "forward",
     precision: Literal["float64", "float32"] = "float64",
+    target: Literal["numba", "triton"] = "numba",
 ) -> int:
     """Print the source of the compiled loop that evaluates a spline.
 
@@ -217,8 +218,10 @@ def show(
         derivatives: how many time derivatives, 0 to 3.
         sweep: the values, or the gradients.
         precision: of the numbers.
+        target: what compiles it: numba for the CPU, triton for a GPU.
     """
-    kernels = kernels_of(Group(group).name, order, derivatives, getattr(torch, precision), nanoseconds=False)
+    chosen = Group(group).name, order, derivatives, getattr(torch, precision)
+    kernels = kernels_of(*chosen, nanoseconds=False) if target == "numba" else triton_kernels_of(*chosen)
     print(kernels.forward_source() if sweep == "forward" else kernels.reverse_source())
     return 0
 

@@ -34,6 +34,9 @@ class GroupArithmetic(ABC):
     matrix_size: int
     #: Component ranges [start, stop) whose common sign is free (unit quaternions cover rotations twice).
     sign_blocks: tuple[tuple[int, int], ...] = ()
+    #: Ranges that hold a unit vector and are stored at any length, which `normalize` takes away. A sign block around
+    #: one (that of dual quaternions is wider) is stored at its length as a whole.
+    unit_blocks: tuple[tuple[int, int], ...] = ()
 
     @abstractmethod
     def identity(self) -> tuple[float, ...]:
@@ -42,6 +45,10 @@ class GroupArithmetic(ABC):
     @abstractmethod
     def normalize(self, stored: Vector) -> Vector:
         """The unit representative of stored numbers."""
+
+    def sample(self, normals: Vector) -> Vector:
+        """A random point from as many standard normal numbers: rotations uniform, translations standard normal."""
+        return self.normalize(normals)
 
     def long_way(self, X: Vector) -> tuple[Scalar, ...]:
         """For each sign block, whether X lies on the far side, so that its sign has to flip before a logarithm."""
@@ -62,6 +69,14 @@ class GroupArithmetic(ABC):
     @abstractmethod
     def log(self, X: Vector) -> Vector:
         """The shortest x with Exp(x) = X; at exactly pi its first non-zero rotation component is positive."""
+
+    def signed_log(self, X: Vector) -> Vector:
+        """The x with Exp(x) = X, signs of numbers included: beyond pi, up to 2 pi, where they lie on the far side.
+
+        On the double cover, as on SU(2) in [H18] (11)-(13). At minus the identity, where no axis is nearer
+        than another, that of the identity; it jumps there.
+        """
+        return self.log(X)
 
     @abstractmethod
     def act(self, X: Vector, point: Vector) -> Vector:

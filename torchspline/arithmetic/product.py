@@ -5,6 +5,7 @@ on pairs of points, one for each factor; as a pose it is read by `kinematics`.
 """
 
 from collections.abc import Iterator
+from itertools import accumulate
 from typing import Any
 
 from torchspline.arithmetic.group import GroupArithmetic, Matrix
@@ -20,12 +21,14 @@ class Product(GroupArithmetic):
         self.tangent_size = sum(f.tangent_size for f in factors)
         self.act_size = sum(f.act_size for f in factors)
         self.matrix_size = sum(f.matrix_size for f in factors)
-        blocks: list[tuple[int, int]] = []
-        offset = 0
-        for f in factors:
-            blocks += [(offset + start, offset + stop) for start, stop in f.sign_blocks]
-            offset += f.point_size
-        self.sign_blocks = tuple(blocks)
+        offsets = list(accumulate((f.point_size for f in factors), initial=0))
+        for kind in ("sign_blocks", "unit_blocks"):
+            blocks = [
+                (offset + start, offset + stop)
+                for offset, f in zip(offsets, factors, strict=False)
+                for start, stop in getattr(f, kind)
+            ]
+            setattr(self, kind, tuple(blocks))
 
     def _split(self, kind: str, *vectors: Vector) -> Iterator[tuple[GroupArithmetic, tuple[Vector, ...]]]:
         """Each factor with its share of the vectors; `kind` has a letter a vector: Point, Tangent or Acted on."""
@@ -48,6 +51,9 @@ class Product(GroupArithmetic):
     def normalize(self, stored: Vector) -> Vector:
         return self._each("normalize", "P", stored)
 
+    def sample(self, normals: Vector) -> Vector:
+        return self._each("sample", "P", normals)
+
     def long_way(self, X: Vector) -> tuple[Scalar, ...]:
         return self._each("long_way", "P", X)
 
@@ -62,6 +68,9 @@ class Product(GroupArithmetic):
 
     def log(self, X: Vector) -> Vector:
         return self._each("log", "P", X)
+
+    def signed_log(self, X: Vector) -> Vector:
+        return self._each("signed_log", "P", X)
 
     def act(self, X: Vector, point: Vector) -> Vector:
         return self._each("act", "PA", X, point)

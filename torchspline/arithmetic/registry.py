@@ -2,14 +2,19 @@
 
 import re
 
+from torchspline.arithmetic.dual_quaternion import DualQuaternion
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.product import Product
 from torchspline.arithmetic.rn import Rn
+from torchspline.arithmetic.se2 import SE2
 from torchspline.arithmetic.se3 import SE3
+from torchspline.arithmetic.so2 import SO2
 from torchspline.arithmetic.so3 import SO3
 
 #: Groups with a fixed name; `R<n>` and products such as `R3xSO3` are read from the name and join them when first used.
-GROUPS: dict[str, GroupArithmetic] = {group.name: group for group in (SO3(), SE3())}
+GROUPS: dict[str, GroupArithmetic] = {
+    group.name: group for group in (SO3(), SE3(), DualQuaternion(), SO2(), SE2())
+}
 
 _FIXED = ", ".join(map(repr, GROUPS))
 

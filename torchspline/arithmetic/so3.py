@@ -66,11 +66,14 @@ def rotation_log(q: Vector) -> Vector:
     near zero and no square root whose derivative could be infinite.
     """
     far = on_far_side(q)
-    w, x, y, z = (where(far, -c, c) for c in q)
-    v = (x, y, z)
-    reciprocal = 1.0 / (1.0 + w)
-    factor = 4.0 * reciprocal * series.arctan_factor(dot(v, v) * (reciprocal * reciprocal))
-    return scale(factor, v)
+    near = tuple(where(far, -c, c) for c in q)
+    return scale(log_factor(near), near[1:])
+
+
+def log_factor(q: Vector) -> Scalar:
+    """theta / sin(theta/2), the ratio of rotation vector and vector part, of a unit quaternion on the near side."""
+    reciprocal = 1.0 / (1.0 + q[0])
+    return 4.0 * reciprocal * series.arctan_factor(dot(q[1:], q[1:]) * (reciprocal * reciprocal))
 
 
 def rotation_exp(x: Vector, short: bool) -> Vector:
@@ -83,13 +86,20 @@ def unit(q: Vector) -> Vector:
     return scale(1.0 / sqrt(dot(q, q)), q)
 
 
+def full_turn_back(x: Vector, far: Scalar) -> Scalar:
+    """-2 pi / |x| on the far side, else 0; 0 too at minus the identity, which turns about no axis."""
+    size2 = dot(x, x)
+    turning = far & (-size2 < 0.0)  # `>` would be a far path to the tracer
+    return where(turning, -6.283185307179586 / sqrt(where(turning, size2, 1.0)), 0.0)
+
+
 class SO3(AdjointSeriesGroup):
     name = "SO3"
     point_size = 4
     tangent_size = 3
     act_size = 3
     matrix_size = 3
-    sign_blocks = ((0, 4),)
+    sign_blocks = unit_blocks = ((0, 4),)
 
     def identity(self) -> tuple[float, ...]:
         return (1.0, 0.0, 0.0, 0.0)
@@ -111,6 +121,10 @@ class SO3(AdjointSeriesGroup):
 
     def log(self, X: Vector) -> Vector:
         return rotation_log(X)
+
+    def signed_log(self, X: Vector) -> Vector:
+        x, far = rotation_log(X), on_far_side(X)
+        return add(x, scale(full_turn_back(x, far), x))
 
     def act(self, X: Vector, point: Vector) -> Vector:
         return rotate(X, point)

@@ -21,13 +21,14 @@ class Bends:
 
     Args:
         weight: (D,), of each component.
+        last: only those that begin before this control point; None for all.
     """
 
-    def __init__(self, model: Model, weight: Array):
+    def __init__(self, model: Model, weight: Array, last: int | None = None):
         spline = model.trajectory
         self.weight, self.module = weight, spline.module
         self.span = min(3, spline.count)
-        first = np.arange(spline.count - self.span + 1)
+        first = np.arange(spline.count - self.span + 1)[:last]
         own = model.columns[id(spline.module)]
         self.columns = own[first[:, None] + np.arange(self.span)].reshape(len(first), -1)
         self.bases = np.ascontiguousarray(first[:, None].astype(np.int64))

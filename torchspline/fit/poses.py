@@ -117,7 +117,7 @@ def fit_poses(
         usable[:, None], poses.detach(), SE3.identity(dtype=poses.dtype, device=poses.device)
     )
     checks.finite("poses", filled)
-    checks.quaternions("poses", filled, SE3.arithmetic.sign_blocks)
+    checks.quaternions("poses", filled, SE3.arithmetic.unit_blocks)
     order_of_time = torch.argsort(t, stable=True)
     rows = order_of_time[usable[order_of_time]]
     times, measured = t.detach()[rows].cpu(), poses.detach()[rows].to("cpu", torch.float64)

@@ -10,6 +10,7 @@ from torchspline.fit.model import Model, State
 from torchspline.fit.system import System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
+from torchspline.splines.local import LocalSpline
 
 Array = NDArray[Any]
 
@@ -65,7 +66,7 @@ class BoundPrior:
         """Add cost and normal equations; the steps' own Jacobians are those of the logarithm."""
         steps, jacobians = [], []
         for part in self.prior.parts:
-            step, jacobian = _step(part, state)
+            step, jacobian = steps_of(part, state)
             steps.append(step.reshape(-1))
             jacobians += list(jacobian)
         x, J = np.concatenate(steps), _block_diagonal(jacobians)
@@ -87,15 +88,18 @@ def _block_step(part: Part, now: torch.Tensor) -> torch.Tensor:
     return unknown.group.log(unknown.group.between(reference, now, validate=False), validate=False)
 
 
-def _step(part: Part, state: State) -> tuple[Array, Array]:
+def steps_of(part: Part, state: State) -> tuple[Array, Array]:
     """Tangents from the reference to where the unknowns stand (C, D), and their Jacobians (C, D, D)."""
     unknown = part.unknown
     if isinstance(unknown, BSpline):
-        now = torch.from_numpy(state.points[id(unknown)][part.points])
-    else:
-        now = state.values[id(unknown)].reshape(-1, unknown.size)[part.points]
+        # Pairs of a reference and where it stands now, as splines of two points: their logarithms are compiled.
+        pairs = np.stack([part.reference.numpy(), state.points[id(unknown)][part.points]], axis=1)
+        spline = LocalSpline(unknown.group.name, unknown.order, 1.0, 2)
+        local = spline.at(pairs.reshape(-1, pairs.shape[-1]))
+        return local.logs[::2], spline.pair_jacobians(local)[::2, 1]
+    now = state.values[id(unknown)].reshape(-1, unknown.size)[part.points]
     step = _block_step(part, now)
-    if isinstance(unknown, Variable) and unknown.sphere:
+    if unknown.sphere:
         # The change of the vector, seen from the basis at the reference.
         at_reference, at_now = unknown.basis(part.reference), unknown.basis(now)
         assert at_reference is not None

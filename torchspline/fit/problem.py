@@ -70,13 +70,13 @@ class Problem:
             for x in (*residual.arguments.values(), *residual.clock.unknowns)
             if isinstance(x, (Variable, BSpline))
         ]
-        self._unknowns += self._new(unknowns)
+        self.know(unknowns)
         self.residuals.append(residual)
         self._indices.append(indices)
         return residual
 
-    def _new(self, unknowns: list[Unknown]) -> list[Unknown]:
-        """Those not known yet, each once; nothing is added before all were looked at."""
+    def know(self, unknowns: Sequence[Unknown]) -> None:
+        """Count these among the unknowns, all or none of them; those of residuals are without being asked."""
         new: list[Unknown] = []
         for x in unknowns:
             known = [*self._unknowns, *new]
@@ -87,7 +87,7 @@ class Problem:
             elif any(isinstance(y, Variable) and y.name == x.name for y in known):
                 raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
             new.append(x)
-        return new
+        self._unknowns += new
 
     def _check_times(self, residual: Residual) -> None:
         t, domain = residual.t.detach(), self.trajectory.domain
@@ -136,7 +136,7 @@ class Problem:
         assert root is not None
         root = root.detach().cpu()
         matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
-        self._unknowns += self._new([variable])
+        self.know([variable])
         reference = variable.points(variable.value).reshape(count, -1)
         H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
         self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
@@ -208,14 +208,9 @@ class Problem:
         Raises:
             ValueError: nothing to solve, a wrong option, a cost that is not finite.
         """
-        checks.whole("max_iterations", max_iterations, least=0)
-        for name, x in (("cost_tolerance", cost_tolerance), ("gradient_tolerance", gradient_tolerance)):
-            if checks.finite_number(name, x) < 0:
-                raise ValueError(f"{name}: expected a number that is not negative, got {x}")
-        checks.positive("damping", damping)
+        options = Options.checked(max_iterations, cost_tolerance, gradient_tolerance, damping)
         if not self.residuals:
             raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
-        options = Options(max_iterations, cost_tolerance, gradient_tolerance, damping)
         with torch.no_grad(), progress_bar(progress, max_iterations) as show:
             linearizer = self.prepare()
             model = linearizer.model

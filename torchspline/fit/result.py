@@ -52,7 +52,7 @@ class Result:
         state: State,
         system: System,
         trace: Trace,
-        numbers: dict[int, Tensor] | None,
+        numbers: dict[int, Tensor] | None = None,
     ):
         self._linearizer, self._state, self._system = linearizer, state, system
         model = linearizer.model

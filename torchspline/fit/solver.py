@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchspline import checks
 from torchspline.fit.model import Model, State
 from torchspline.fit.system import Factor, SingularError, System
 from torchspline.kernels.mode import RefusedError
@@ -37,6 +38,18 @@ class Options:
     cost: float = 1e-9
     gradient: float = 1e-8
     damping: float = 1e-5
+
+    @classmethod
+    def checked(
+        cls, max_iterations: int, cost_tolerance: float, gradient_tolerance: float, damping: float
+    ) -> "Options":
+        """From what a caller chose, by the caller's names."""
+        checks.whole("max_iterations", max_iterations, least=0)
+        for name, x in (("cost_tolerance", cost_tolerance), ("gradient_tolerance", gradient_tolerance)):
+            if checks.finite_number(name, x) < 0:
+                raise ValueError(f"{name}: expected a number that is not negative, got {x}")
+        checks.positive("damping", damping)
+        return cls(max_iterations, cost_tolerance, gradient_tolerance, damping)
 
 
 @dataclass
@@ -97,7 +110,9 @@ def minimise(
                 gain = -1.0
             clock = trace.spend("linearize", clock)
             trace.evaluations += 1
-            if gain <= 0 and expected <= max(options.cost, _ROUNDING) * system.cost:
+            # A step that is short because of much damping proves nothing.
+            near = damping <= 1.0 and expected <= max(options.cost, _ROUNDING) * system.cost
+            if gain <= 0 and near:
                 trace.reason, trace.converged = "no step lowers the cost any more", True
                 return state, system, trace
         if gain > 0:

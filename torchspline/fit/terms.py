@@ -194,14 +194,19 @@ class Term:
 
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
+        for _, costs, rows, residual in self.chunks(state):
+            yield float(costs.sum()), rows, residual
+
+    def chunks(self, state: State) -> Iterator[tuple[slice, Array, Rows, Array]]:
+        """The same with the cost of each measurement, and which they are in order of time."""
         places, span = self.places(state), self.model.trajectory.order
         for begin, stop, first, last in _chunks(places.starts, CHUNK):
-            cost, rows, residual = self._chunk(state, places, slice(begin, stop))
+            costs, rows, residual = self._chunk(state, places, slice(begin, stop))
             starts = places.starts[first : last + 1] - begin
             part = Rows(rows, starts, places.bases[first:last], places.columns[first:last], span)
-            yield cost, part, residual
+            yield slice(begin, stop), costs, part, residual
 
-    def _chunk(self, state: State, places: Places, part: slice) -> tuple[float, Array, Array]:
+    def _chunk(self, state: State, places: Places, part: slice) -> tuple[Array, Array, Array]:
         model, kernel = self.model, self.kernel
         spline, local = model.trajectory, state.local
         assert local is not None
@@ -221,7 +226,7 @@ class Term:
         width = places.columns.shape[1] + 1
         N, R = residual.shape
         rows = np.empty((N, R, width))
-        error, weight, cost = self._weigh(residual, part, places.outside[part])
+        error, weight, costs = self._weigh(residual, part, places.outside[part])
         rows[..., -1] = error
         at = 0
         for g, b, x, parts in zip(moments, base, u, kernel.parts, strict=True):
@@ -247,7 +252,7 @@ class Term:
         for column in times:
             rows[..., at] = _apply(weight, column[..., None])[..., 0]
             at += 1
-        return cost, rows, residual
+        return costs, rows, residual
 
     def _argument(self, slot: str, state: State, places: Places, part: slice) -> Array:
         """Numbers of an argument: one for all measurements, or one each."""
@@ -265,8 +270,8 @@ class Term:
             return value[self.order[part]]
         return value[self.index[slot][part]] if slot in self.index else value.reshape(-1)
 
-    def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, float]:
-        """Weighted residual, the weights its Jacobian takes as well, and the cost."""
+    def _weigh(self, residual: Array, part: slice, outside: Array) -> tuple[Array, Array | None, Array]:
+        """Weighted residual, the weights its Jacobian takes as well, and the cost of each measurement."""
         weight = self.weights
         if weight is not None and weight.shape[0] > 1:
             weight = weight[part]
@@ -274,7 +279,7 @@ class Term:
         squared = np.einsum("nr,nr->n", error, error)
         loss = self.residual.loss
         if loss is None and not outside.any():
-            return error, weight, 0.5 * float(squared.sum())
+            return error, weight, 0.5 * squared
         s = torch.from_numpy(squared)
         rho, slope = (
             (squared, np.ones_like(squared))
@@ -287,7 +292,7 @@ class Term:
             weight = root if weight is None else weight * root
         else:
             weight = weight * root[..., None]
-        return error * root, weight, 0.5 * float((rho * inside).sum())
+        return error * root, weight, 0.5 * rho * inside
 
 
 def _apply(weight: Array | None, g: Array) -> Array:

@@ -1,6 +1,6 @@
 """Tensor-facing Lie groups and conversions to other representations."""
 
 from torchspline.groups import convert
-from torchspline.groups.group import R3, SE3, SO3, Group, Rn, product
+from torchspline.groups.group import R3, SE2, SE3, SO2, SO3, DualQuaternion, Group, Rn, product
 
-__all__ = ["R3", "SE3", "SO3", "Group", "Rn", "convert", "product"]
+__all__ = ["R3", "SE2", "SE3", "SO2", "SO3", "DualQuaternion", "Group", "Rn", "convert", "product"]

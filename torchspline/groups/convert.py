@@ -1,5 +1,5 @@
-"""Rotations and poses in the conventions of others: xyzw quaternions, matrices, Euler angles, SciPy, PyPose,
-pytorch-kinematics.
+"""Rotations and poses in the conventions of others: xyzw quaternions, matrices, Euler angles, dual quaternions, screws,
+SciPy, PyPose, pytorch-kinematics.
 
 A rotation q here is a quaternion [w, x, y, z], a pose is [x, y, z, qw, qx, qy, qz]; both take coordinates of the
 body to coordinates of the world. Quaternions may have any length from 1e-15 to 1e15. What is made of tensors is
@@ -9,15 +9,15 @@ looked at on the CPU only).
 """
 
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.arithmetic import so3
+from torchspline.arithmetic import dual_quaternion, so3
 from torchspline.groups.components import join, split
-from torchspline.groups.group import SE3, SO3
+from torchspline.groups.group import SE3, SO3, DualQuaternion
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -194,6 +194,74 @@ def _proper_angles(w: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, 
     return a, 2.0 * torch.atan2(sine, cosine), c
 
 
+# ---------------------------------------------------------------------- dual quaternions and screws
+
+
+def pose_to_dual_quaternion(pose: Tensor) -> Tensor:
+    """Unit dual quaternions [real(4), dual(4)], `(..., 8)`, of poses `(..., 7)`, [H18] (23) without its spurious q'."""
+    unit = SE3.arithmetic.normalize(split(_pose("pose", pose)))
+    return join(dual_quaternion.from_pose(unit), pose)
+
+
+def pose_from_dual_quaternion(Q: Tensor) -> Tensor:
+    """Poses `(..., 7)` of dual quaternions `(..., 8)`, whose real parts may have any length but zero."""
+    unit = DualQuaternion.arithmetic.normalize(split(_dual_quaternion(Q)))
+    return join((*dual_quaternion.DualQuaternion().translation(unit), *unit[:4]), Q)
+
+
+class Screw(NamedTuple):
+    """A rigid motion as a rotation about a line and a translation along it, [H18] (24).
+
+    `angle` (...) in rad, from 0 to pi; `pitch` (...) in m, the whole translation along the axis; `axis` (..., 3), its
+    unit direction; `moment` (..., 3) in m, `p x axis` for every point p of the line.
+    """
+
+    angle: Tensor
+    pitch: Tensor
+    axis: Tensor
+    moment: Tensor
+
+
+def to_screw(Q: Tensor) -> Screw:
+    """The screw of dual quaternions `(..., 8)`, the short way round.
+
+    Without rotation the axis runs along the translation through the origin; the identity turns about x. Unlike exp,
+    log and power, which need no axis, this is not differentiable where the angle is zero.
+    """
+    v, w = DualQuaternion.log(_dual_quaternion(Q), validate=False).split(3, dim=-1)
+    # The square of a smaller angle is not a normal number; the translation of such a rotation differs by less than
+    # rounding from a pure one.
+    turns = (w * w).sum(-1, keepdim=True) > torch.finfo(Q.dtype).tiny
+    slides = (v * v).sum(-1, keepdim=True) > torch.finfo(Q.dtype).tiny
+    x_axis = w.new_tensor([1.0, 0.0, 0.0]).expand_as(w)
+    line = torch.where(turns, w, torch.where(slides, v, x_axis))
+    size = line.norm(dim=-1, keepdim=True)
+    axis = line / size
+    pitch = (v * axis).sum(-1, keepdim=True)
+    angle = torch.where(turns, size, 0.0)
+    moment = torch.where(turns, (v - pitch * axis) / torch.where(turns, size, 1.0), 0.0)
+    return Screw(angle.squeeze(-1), pitch.squeeze(-1), axis, moment)
+
+
+def from_screw(angle: Tensor, pitch: Tensor, axis: Tensor, moment: Tensor) -> Tensor:
+    """Unit dual quaternions `(..., 8)` of screws: see `Screw`; any angle, `axis` of length one.
+
+    Raises:
+        ValueError: an axis whose length is off by more than 1e-3.
+    """
+    for name, x in (("angle", angle), ("pitch", pitch), ("axis", axis), ("moment", moment)):
+        checks.is_floating_tensor(name, x)
+        if name in ("axis", "moment"):
+            checks.has_last(name, x, 3, "x, y, z")
+        checks.finite(name, x)
+    checks.same_kind(angle=angle, pitch=pitch, axis=axis, moment=moment)
+    checks.broadcast(angle=angle.shape, pitch=pitch.shape, axis=axis.shape[:-1], moment=moment.shape[:-1])
+    checks.unit_length("axis", axis, 1e-3)
+    angle, pitch = angle.unsqueeze(-1), pitch.unsqueeze(-1)
+    v, w = torch.broadcast_tensors(angle * moment + pitch * axis, angle * axis)
+    return DualQuaternion.exp(torch.cat([v, w], dim=-1), validate=False)
+
+
 # ---------------------------------------------------------------------- SciPy
 
 
@@ -335,6 +403,11 @@ def _pose(name: str, pose: Tensor) -> Tensor:
     checks.finite(name, pose)
     checks.quaternions(name, pose, ((3, 7),))
     return pose
+
+
+def _dual_quaternion(Q: Tensor) -> Tensor:
+    checks.point("Q", Q, DualQuaternion, "a dual quaternion [real(4), dual(4)]")
+    return Q
 
 
 def _reorder(x: Tensor, order: tuple[int, ...]) -> Tensor:

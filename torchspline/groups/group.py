@@ -17,7 +17,7 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Group:
-    """A Lie group by name: "SO3", "SE3", "R<n>", or a direct product such as "R3xSO3".
+    """A Lie group by name: "SO3", "SE3", "DualQuaternion", "SO2", "SE2", "R<n>", or a direct product such as "R3xSO3".
 
     Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`, [v, omega] in m and rad; leading dimensions
     broadcast. Every method is differentiable in its tensors to any order, forwards and backwards; `log`,
@@ -73,7 +73,7 @@ class Group:
         if generator is not None:
             checks.instance("generator", generator, torch.Generator, "a torch.Generator")
         numbers = torch.randn(*batch, self.point_size, generator=generator, dtype=dtype, device=device)
-        return join(self.arithmetic.normalize(split(numbers)), numbers)
+        return join(self.arithmetic.sample(split(numbers)), numbers)
 
     def from_matrix(self, matrix: Tensor) -> Tensor:
         """Points `(..., point_size)` of (homogeneous) matrices `(..., n, n)`; differentiable at half-turns too.
@@ -130,17 +130,21 @@ class Group:
             s: a number, or a tensor whose shape broadcasts with the batch shape of the points.
         """
         self._accept(validate, start=(start, "point"), end=(end, "point"))
-        if not isinstance(s, Tensor):
-            checks.number("s", s)
-            s = torch.as_tensor(s, dtype=start.dtype, device=start.device)
-        checks.is_floating_tensor("s", s)
-        checks.same_kind(start=start, s=s)
-        checks.broadcast(start=start.shape[:-1], end=end.shape[:-1], s=s.shape)
-        if validate:
-            checks.finite("s", s)
-        return run("interpolate", self.name, start, end, s.unsqueeze(-1))
+        weight = self._weight("s", s, validate, start=start, end=end)
+        return run("interpolate", self.name, start, end, weight)
 
     # ------------------------------------------------------------------ compositions of these
+
+    def power(self, point: Tensor, exponent: Tensor | float, *, validate: bool = True) -> Tensor:
+        """`Exp(exponent Log(point))`: -1 is the inverse, 0.5 the square root on the shortest geodesic, [H18] (24).
+
+        Args:
+            exponent: a number, or a tensor whose shape broadcasts with the batch shape of the points.
+        """
+        self._accept(validate, point=(point, "point"))
+        weight = self._weight("exponent", exponent, validate, point=point)
+        one = point.new_tensor(self.arithmetic.identity())
+        return run("interpolate", self.name, one, point, weight)
 
     def between(self, start: Tensor, end: Tensor, *, validate: bool = True) -> Tensor:
         """`start^-1 end`, the end as seen from the start."""
@@ -212,6 +216,19 @@ class Group:
 
     # ------------------------------------------------------------------ helpers
 
+    def _weight(self, name: str, s: Tensor | float, validate: bool, **points: Tensor) -> Tensor:
+        """The argument `name`, a number for each point, with a dimension for the components."""
+        first_name, first = next(iter(points.items()))
+        if not isinstance(s, Tensor):
+            checks.number(name, s)
+            s = torch.as_tensor(s, dtype=first.dtype, device=first.device)
+        checks.is_floating_tensor(name, s)
+        checks.same_kind(**{first_name: first, name: s})
+        checks.broadcast(**{n: x.shape[:-1] for n, x in points.items()}, **{name: s.shape})
+        if validate:
+            checks.finite(name, s)
+        return s.unsqueeze(-1)
+
     def _jacobian(self, kind: str, tangent: Tensor, validate: bool) -> Tensor:
         self._accept(validate, tangent=(tangent, "tangent"))
         x = split(tangent.unsqueeze(-2))
@@ -248,7 +265,7 @@ class Group:
         for name, (x, kind) in arguments.items():
             checks.finite(name, x)
             if kind == "point":
-                checks.quaternions(name, x, self.arithmetic.sign_blocks)
+                checks.quaternions(name, x, self.arithmetic.unit_blocks)
 
 
 def _new(batch: tuple[int, ...], dtype: torch.dtype) -> None:
@@ -259,8 +276,11 @@ def _new(batch: tuple[int, ...], dtype: torch.dtype) -> None:
         raise TypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
 
 
+SO2 = Group("SO2")
+SE2 = Group("SE2")
 SO3 = Group("SO3")
 SE3 = Group("SE3")
+DualQuaternion = Group("DualQuaternion")
 R3 = Group("R3")
 
 

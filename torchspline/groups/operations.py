@@ -8,6 +8,7 @@ they consist of plain differentiable arithmetic.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cache, reduce
+from itertools import chain
 from operator import and_
 from typing import Any
 
@@ -47,6 +48,16 @@ class Operation(ABC):
     #: What each argument is: "point", or anything else whose numbers only have to be finite; and what the result is.
     kinds: tuple[str, ...]
     result = "point"
+
+    def compiles(self, group: GroupArithmetic) -> tuple[bool, bool]:
+        """Whether kernels are compiled, forward and in reverse: straight-line code of thousands of operations takes
+        minutes."""
+        return True, True
+
+    def result_size(self, group: GroupArithmetic) -> int:
+        """Components of the result."""
+        by_kind = {"point": group.point_size, "tangent": group.tangent_size, "vector": group.act_size}
+        return by_kind[self.result]
 
     @abstractmethod
     def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
@@ -181,6 +192,56 @@ class Interpolate(Operation):
         return group.push(value, xi)
 
 
+class Geodesics(Operation):
+    """`start Exp(l_1 d_1) ... Exp(l_n d_n)` and its body-frame rates by u, for any l_j(u): one row
+    [value, velocity, ...].
+
+    The steps come as d_1, ..., d_n in a row, the weights as l_1 ... l_n, then their first derivatives, and so on.
+    [E17] (24), (33), (36) mirrored to the body frame, and the structural differentials (39)-(52) as one reverse sweep.
+    """
+
+    kinds = ("point", "tangent", "scalar")
+
+    def __init__(self, count: int, derivatives: int):
+        self.count, self.derivatives = count, derivatives
+
+    def result_size(self, group: GroupArithmetic) -> int:
+        return group.point_size + self.derivatives * group.tangent_size
+
+    def compiles(self, group: GroupArithmetic) -> tuple[bool, bool]:
+        size = self.count * group.tangent_size
+        return size <= 30, size <= 15
+
+    def _sweep(
+        self, group: GroupArithmetic, arguments: Arguments
+    ) -> tuple[list[Vector], list[Vector], Vector, list[Step]]:
+        start, steps, weights = arguments
+        d, l = _chop(steps, group.tangent_size), _chop(weights, self.count)
+        return d, l, *forward(group, group.normalize(start), d, l, self.derivatives)
+
+    def forward(self, group: GroupArithmetic, arguments: Arguments) -> Vector:
+        _, _, value, trace = self._sweep(group, arguments)
+        return (*value, *chain.from_iterable(trace[-1].rates))
+
+    def reverse(self, group: GroupArithmetic, arguments: Arguments, cotangent: Vector) -> Arguments:
+        d, l, value, trace = self._sweep(group, arguments)
+        size = group.point_size
+        rates_g = _chop(cotangent[size:], group.tangent_size)
+        g, d_g, l_g = reverse(group, d, l, trace, group.pull(value, cotangent[:size]), rates_g)
+        return group.embed(arguments[0], g), tuple(chain(*d_g)), tuple(chain(*l_g))
+
+    def tangent(self, group: GroupArithmetic, arguments: Arguments, rates: Arguments) -> Vector:
+        d, l, value, trace = self._sweep(group, arguments)
+        start_rate = group.extract(arguments[0], rates[0])
+        d_rate, l_rate = _chop(rates[1], group.tangent_size), _chop(rates[2], self.count)
+        xi, moved = tangent(group, d, l, trace, start_rate, d_rate, l_rate)
+        return (*group.push(value, xi), *chain(*moved))
+
+
+def _chop(v: Vector, size: int) -> list[Vector]:
+    return [v[i : i + size] for i in range(0, len(v), size)]
+
+
 #: A new operation is a class above, a line here and a method of `Group`.
 OPERATIONS: dict[str, Operation] = {
     "exp": Exp(),
@@ -192,14 +253,21 @@ OPERATIONS: dict[str, Operation] = {
 }
 
 
+def operation_of(name: str) -> Operation:
+    """By name: one of `OPERATIONS`, or "geodesics_<steps>_<derivatives>", which join them when first used."""
+    if name not in OPERATIONS:
+        kind, count, derivatives = name.split("_")
+        assert kind == "geodesics"
+        OPERATIONS[name] = Geodesics(int(count), int(derivatives))
+    return OPERATIONS[name]
+
+
 def _result_size(operation: str, group: str) -> int:
-    sizes = arithmetic(group)
-    by_kind = {"point": sizes.point_size, "tangent": sizes.tangent_size, "vector": sizes.act_size}
-    return by_kind[OPERATIONS[operation].result]
+    return operation_of(operation).result_size(arithmetic(group))
 
 
 def _forward(operation: str, group: str, *arguments: Tensor) -> Tensor:
-    components = OPERATIONS[operation].forward(arithmetic(group), tuple(map(split, arguments)))
+    components = operation_of(operation).forward(arithmetic(group), tuple(map(split, arguments)))
     return join(components, arguments[0])
 
 
@@ -207,7 +275,7 @@ def _reverse(
     operation: str, group: str, arguments: tuple[Tensor, ...], cotangent: Tensor
 ) -> tuple[Tensor, ...]:
     components = tuple(map(split, arguments))
-    gradients = OPERATIONS[operation].reverse(arithmetic(group), components, split(cotangent))
+    gradients = operation_of(operation).reverse(arithmetic(group), components, split(cotangent))
     return tuple(join(g, x) for g, x in zip(gradients, arguments, strict=True))
 
 
@@ -239,7 +307,7 @@ class GroupFunction(Function):
                 zero(x.shape[-1]) if rate is None else split(rate)
                 for x, rate in zip(arguments, rates, strict=True)
             )
-            result = OPERATIONS[ctx.operation].tangent(arithmetic(ctx.group), components, moved)
+            result = operation_of(ctx.operation).tangent(arithmetic(ctx.group), components, moved)
             return join(result, arguments[0])
 
 
@@ -289,7 +357,8 @@ def run(operation: str, group: str, *arguments: Tensor, check: Callable[[], None
     expanded = tuple(x.expand(*batch, x.shape[-1]) for x in arguments)
     if torch.compiler.is_compiling():
         return _compiled(operation, group, list(expanded))
-    if batch.numel() >= FUSED_ROWS and usable(*arguments):
+    compiles, _ = operation_of(operation).compiles(arithmetic(group))
+    if compiles and batch.numel() >= FUSED_ROWS and usable(*arguments):
         result = fused(operation, group, expanded, validate=check is not None)
         if result is not None:
             return result
@@ -303,7 +372,7 @@ def _kernels(
     operation: str, group: str, sizes: tuple[int, ...], dtype: torch.dtype
 ) -> tuple[RowKernel, RowKernel]:
     """Forward and reverse of an operation; the forward refuses rows that the checks would."""
-    algebra, rules = arithmetic(group), OPERATIONS[operation]
+    algebra, rules = arithmetic(group), operation_of(operation)
 
     def valid(*components: Vector) -> Symbol:
         pairs = zip(rules.kinds, components, strict=True)
@@ -347,7 +416,8 @@ class FusedGroupFunction(Function):
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         arguments = ctx.saved_tensors
-        if torch.is_grad_enabled() or transformed() or batched(cotangent):
+        _, compiles = operation_of(ctx.operation).compiles(arithmetic(ctx.group))
+        if not compiles or torch.is_grad_enabled() or transformed() or batched(cotangent):
             return None, None, None, *_reverse(ctx.operation, ctx.group, arguments, cotangent)
         gradients = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in arguments]
         rows = cotangent.shape[:-1].numel()
@@ -361,3 +431,18 @@ def fused(operation: str, group: str, arguments: tuple[Tensor, ...], validate: b
         return FusedGroupFunction.apply(operation, group, validate, *arguments)
     except RefusedError:
         return None
+
+
+def geodesics(group: str, start: Tensor, steps: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+    """Value and rates by u of products of geodesics, see `Geodesics`.
+
+    Args:
+        start: stored points `(*B, P)`; steps: `(*B, n, D)`; weights: `(*B, R + 1, n)`, l_j and R of its derivatives by
+            u. All three broadcast over B.
+    Returns:
+        `(*B, P)` and R times `(*B, D)`.
+    """
+    derivatives, count = weights.shape[-2] - 1, weights.shape[-1]
+    sizes = arithmetic(group)
+    rows = run(f"geodesics_{count}_{derivatives}", group, start, steps.flatten(-2), weights.flatten(-2))
+    return rows.split([sizes.point_size, *[sizes.tangent_size] * derivatives], dim=-1)

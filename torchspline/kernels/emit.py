@@ -51,7 +51,7 @@ def _source(
     parts: dict[str, list[str]],
     fastmath: str,
 ) -> str:
-    """One function: `before` the blocks, `gather`, the arithmetic, `again`, `scatter`, `after`."""
+    """One function: `before` the blocks, `gather`, `copy`, the arithmetic, `again`, `scatter`, `after`."""
     single = dtype == torch.float32
     outputs = max(len(program.outputs), 1)
     lines = [
@@ -63,6 +63,7 @@ def _source(
         f"        n = min({BLOCK}, stop - block)",
         "        for i in range(n):",
         *(f"            {line}" for line in parts["gather"]),
+        *(f"        {line}" for line in parts.get("copy", [])),
         *(f"        {line}" for line in _middle(program, single)),
         *(f"        {line}" for line in parts.get("again", [])),
         "        for i in range(n):",
@@ -164,9 +165,19 @@ def emit_pairs(
     return _source(name, ["stored", "points", "unit", "logs", "begin", "stop"], program, dtype, parts, _EXACT)
 
 
-def _locate(nanoseconds: bool) -> list[str]:
-    """Segment and place within it of query `block + i`, as in `splines/clock.py`, and the row of its trajectory."""
-    if nanoseconds:
+def _locate(nanoseconds: bool | None) -> list[str]:
+    """Segment and place within it of query `block + i`, as in `splines/clock.py`, and the row of its trajectory.
+
+    Args:
+        nanoseconds: whether times are; None: they are pairs of a place and a segment.
+    """
+    if nanoseconds is None:
+        place = [
+            "at = 2 * (column if shared else block + i)",
+            "u = times[at]",
+            "segment = min(max(int(times[at + 1]), 0), segments - 1)",
+        ]
+    elif nanoseconds:
         place = [
             "elapsed = times[column if shared else block + i] - t0",
             "segment = min(max(elapsed // dt, 0), segments - 1)",
@@ -191,6 +202,37 @@ def _locate(nanoseconds: bool) -> list[str]:
     ]
 
 
+def _at(array: str, row: str, size: int) -> str:
+    """A line that says where a row begins; unsigned, or Numba would look for negative numbers at every access."""
+    return f"{array}_at = np.uint64({row} * {size})"
+
+
+def _copy(sources: list[tuple[str, int, int]], first: int) -> list[str]:
+    """Copies `(array, size of a row, count)` from row `bases[i]` on into X from its row `first` on.
+
+    Dense sorted times have whole blocks in one segment (`same`): then numbers are loaded once and spread.
+    """
+    starts = [_at(array, "base", size) for array, size, _ in sources]
+    loads = [f"{array}[{array}_at + np.uint64({c})]" for array, _, count in sources for c in range(count)]
+    return [
+        "if same:",
+        "    base = bases[0]",
+        *(f"    {line}" for line in starts),
+        *(f"    x{c} = {load}" for c, load in enumerate(loads)),
+        f"    for i in range({BLOCK}):",
+        *(f"        X[{(first + c) * BLOCK} + i] = x{c}" for c in range(len(loads))),
+        "else:",
+        "    for i in range(n):",
+        "        base = bases[i]",
+        *(f"        {line}" for line in starts),
+        *(f"        X[{(first + c) * BLOCK} + i] = {load}" for c, load in enumerate(loads)),
+    ]
+
+
+#: What `_copy` wants to know: set before the blocks, and after `_locate`.
+_BASES = [f"bases = np.empty({BLOCK}, dtype=np.int64)", "same = True"]
+_KEEP = ["bases[i] = base", "same = base == bases[0] and (same or i == 0)"]
+
 _CLOCK = ["times", "shared", "t0", "dt", "tolerance", "segments", "points", "queries"]
 _SPAN = ["begin", "stop"]
 _START = ["outside = 0", "row = begin // queries", "column = begin % queries"]
@@ -204,7 +246,7 @@ class SplineLayout(NamedTuple):
     steps: int
     derivatives: int
     dtype: torch.dtype
-    nanoseconds: bool
+    nanoseconds: bool | None
 
 
 def emit_forward(name: str, program: Trace, layout: SplineLayout) -> str:
@@ -212,25 +254,27 @@ def emit_forward(name: str, program: Trace, layout: SplineLayout) -> str:
     lie outside. Program inputs: u, start (point), steps (steps x tangent), scale (derivatives)."""
     point, tangent, steps, derivatives, dtype, nanoseconds = layout
     rates = [f"rate{r}" for r in range(derivatives)]
-    gather = [
-        *_locate(nanoseconds),
-        "X[i] = real(u)",
-        *(f"X[{(1 + c) * BLOCK} + i] = unit[base * {point} + {c}]" for c in range(point)),
-        *(f"X[{(1 + point + c) * BLOCK} + i] = logs[base * {tangent} + {c}]" for c in range(steps * tangent)),
-    ]
+    gather = [*_locate(nanoseconds), "X[i] = real(u)", *_KEEP]
+    copy = _copy([("unit", point, point), ("logs", tangent, steps * tangent)], 1)
     scales = 1 + point + steps * tangent
     before = [
         *_START,
+        *_BASES,
         *(f"X[{(scales + r) * BLOCK}:{(scales + r + 1) * BLOCK}] = scale[{r}]" for r in range(derivatives)),
     ]
-    scatter = [f"value[(block + i) * {point} + {c}] = Y[{c * BLOCK} + i]" for c in range(point)]
-    for r, rate in enumerate(rates):
-        first = point + r * tangent
-        scatter += [
-            f"{rate}[(block + i) * {tangent} + {c}] = Y[{(first + c) * BLOCK} + i]" for c in range(tangent)
-        ]
+    scatter, row = list[str](), 0
+    for array, size in (("value", point), *((rate, tangent) for rate in rates)):
+        scatter.append(_at(array, "(block + i)", size))
+        scatter += [f"{array}[{array}_at + np.uint64({c})] = Y[{(row + c) * BLOCK} + i]" for c in range(size)]
+        row += size
     clock = [*_CLOCK, "scale", "value", *rates, *_SPAN]
-    parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return outside"]}
+    parts = {
+        "before": before,
+        "gather": gather,
+        "copy": copy,
+        "scatter": scatter,
+        "after": ["return outside"],
+    }
     return _source(name, ["unit", "logs", *clock], program, dtype, parts, _SWEEP)
 
 
@@ -243,22 +287,23 @@ def emit_reverse(name: str, program: Trace, layout: SplineLayout) -> str:
     point, tangent, steps, derivatives, dtype, nanoseconds = layout
     rates = [f"rate_g{r}" for r in range(derivatives)]
     sources = [("value", point), ("value_g", point), *((rate, tangent) for rate in rates)]
-    gather, row = [*_locate(nanoseconds), "X[i] = real(u)", "places[i] = base - first"], 1
+    gather, row = [*_locate(nanoseconds), "X[i] = real(u)", *_KEEP], 1
     for array, size in sources:
-        gather += [f"X[{(row + c) * BLOCK} + i] = {array}[(block + i) * {size} + {c}]" for c in range(size)]
+        gather.append(_at(array, "(block + i)", size))
+        gather += [f"X[{(row + c) * BLOCK} + i] = {array}[{array}_at + np.uint64({c})]" for c in range(size)]
         row += size
     count = steps * tangent
-    gather += [f"X[{(row + c) * BLOCK} + i] = logs[base * {tangent} + {c}]" for c in range(count)]
+    copy = _copy([("logs", tangent, count)], row)
     row += count
     before = [
         *_START,
-        f"places = np.empty({BLOCK}, dtype=np.int64)",
+        *_BASES,
         *(f"X[{(row + r) * BLOCK}:{(row + r + 1) * BLOCK}] = scale[{r}]" for r in range(derivatives)),
     ]
     scatter = [
-        "place = places[i]",
-        *(f"start_g[place * {tangent} + {c}] += Y[{c * BLOCK} + i]" for c in range(tangent)),
-        *(f"logs_g[place * {tangent} + {c}] += Y[{(tangent + c) * BLOCK} + i]" for c in range(count)),
+        f"place = np.uint64((bases[i] - first) * {tangent})",
+        *(f"start_g[place + np.uint64({c})] += Y[{c * BLOCK} + i]" for c in range(tangent)),
+        *(f"logs_g[place + np.uint64({c})] += Y[{(tangent + c) * BLOCK} + i]" for c in range(count)),
         f"u_g[block + i] = Y[{(tangent + count) * BLOCK} + i]",
     ]
     clock = [
@@ -273,7 +318,13 @@ def emit_reverse(name: str, program: Trace, layout: SplineLayout) -> str:
         "u_g",
         *_SPAN,
     ]
-    parts = {"before": before, "gather": gather, "scatter": scatter, "after": ["return outside"]}
+    parts = {
+        "before": before,
+        "gather": gather,
+        "copy": copy,
+        "scatter": scatter,
+        "after": ["return outside"],
+    }
     return _source(name, ["logs", *clock], program, dtype, parts, _SWEEP)
 
 

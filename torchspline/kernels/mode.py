@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from operator import attrgetter
 from typing import Any, Literal
 
 import torch
@@ -12,12 +13,17 @@ from torch.autograd import forward_ad
 from torch.nn import Parameter
 
 from torchspline import checks
+from torchspline.kernels import triton
 from torchspline.kernels.build import available
 
 Mode = Literal["auto", "fused", "reference"]
 MODES: tuple[str, ...] = ("auto", "fused", "reference")
 #: Environment variable with the mode of a process.
 VARIABLE = "TORCHSPLINE_KERNELS"
+
+# Subclasses want to see what is done to them.
+_PLAIN = {Tensor, Parameter}
+_is_cpu = attrgetter("is_cpu")
 
 _mode: ContextVar[str | None] = ContextVar("torchspline_kernels", default=None)
 
@@ -28,7 +34,7 @@ def use_kernels(mode: Mode) -> Iterator[None]:
 
     Holds for the thread that entered the block; others follow the environment variable.
     The results are the same up to rounding. "fused" raises `RuntimeError` where a kernel exists but cannot run; calls
-    that have none (extrapolation, group operations on few rows, linear maps) use the reference in every mode.
+    that have none (group operations on few rows or on a GPU, linear maps) use the reference in every mode.
     """
     checks.choice("mode", mode, MODES)
     token = _mode.set(mode)
@@ -44,24 +50,37 @@ def current() -> str:
 
 
 def usable(*tensors: object) -> bool:
-    """Whether a kernel may serve a call with these tensors (numbers are welcome): eager, on the CPU, untransformed."""
+    """Whether a loop may serve a call with these tensors (numbers are welcome): eager, on the CPU, untransformed.
+
+    On a GPU there are none, but see `splines/fused.py`.
+    """
     mode = current()
     if mode == "reference":
         return False
-    seen = tuple(x for x in tensors if isinstance(x, Tensor))
-    plain = (
-        all(x.device.type == "cpu" and type(x) in (Tensor, Parameter) for x in seen)
-        and not (torch.is_grad_enabled() and any(x.is_inference() for x in seen))
+    seen = [x for x in tensors if isinstance(x, Tensor)]
+    eager = plain(*seen)
+    here = eager and all(map(_is_cpu, seen)) and available()
+    if mode == "fused" and not here and not (eager and all(triton_available(x.device) for x in seen)):
+        raise RuntimeError(
+            f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors outside torch.func transforms "
+            "and forward-mode differentiation, and Numba on the CPU or Triton on a GPU"
+        )
+    return here
+
+
+def plain(*tensors: Tensor) -> bool:
+    """Whether these are numbers in memory, and nothing needs to see what is done to them."""
+    return (
+        _PLAIN.issuperset(map(type, tensors))
+        and not (torch.is_grad_enabled() and any(map(Tensor.is_inference, tensors)))
         and not torch.compiler.is_compiling()
         and not transformed()
-        and available()
     )
-    if mode == "fused" and not plain:
-        raise RuntimeError(
-            f"{VARIABLE}=fused: no kernel serves this call; kernels need eager tensors on the CPU outside "
-            "torch.func transforms and forward-mode differentiation, and Numba"
-        )
-    return plain
+
+
+def triton_available(device: torch.device) -> bool:
+    """Whether kernels can be had for a GPU."""
+    return device.type == "cuda" and triton.available(device)
 
 
 def transformed() -> bool:

@@ -144,7 +144,7 @@ def valid_point(group: GroupArithmetic, stored: Vector) -> Symbol:
     """Whether stored numbers are a point: finite, quaternions of a length that can be divided by."""
     valid = finite(stored)
     shortest, longest = (SHORTEST_QUATERNION * 0.999) ** 2, (LONGEST_QUATERNION * 1.001) ** 2
-    for start, stop in group.sign_blocks:
+    for start, stop in group.unit_blocks:
         squared = dot(stored[start:stop], stored[start:stop])
         valid = valid & (-squared < -shortest) & (squared < longest)  # `>` would be a far path, see `trace`
     return valid

@@ -47,12 +47,15 @@ class RowKernel:
 
     def __call__(self, arguments: Sequence[Array], outputs: Sequence[Array], rows: int) -> int:
         """Fill the outputs; how many rows were refused. Arrays are flat."""
-        kernel, refused = self._kernel, []
+        kernel = self._kernel
+        if rows < 2 * SERIAL_BELOW:
+            return kernel(*arguments, *outputs, 0, rows)
+        refused = []
 
         def part(begin: int, stop: int) -> None:
             refused.append(kernel(*arguments, *outputs, begin, stop))
 
-        parts = torch.get_num_threads() if rows >= 2 * SERIAL_BELOW else 1
+        parts = torch.get_num_threads()
         run([partial(part, begin, stop) for begin, stop in spans(rows, parts, emit.BLOCK)])
         return sum(refused)
 

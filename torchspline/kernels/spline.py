@@ -6,7 +6,7 @@ Symbols: B trajectories of M control points with P numbers and D dimensions, N t
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from torchspline.kernels.threads import SERIAL_BELOW, run, spans
 REVERSE_CHUNK = 16384
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # not frozen: that makes them five times as slow to make
 class Clock:
     """Times of all queries, flat, and the knots they refer to; seconds in float64 or whole nanoseconds."""
 
@@ -50,18 +50,38 @@ class Clock:
         if first < last:
             return everything
         offset = first * self.queries if self.shared else 0
-        times = self.times[begin - offset : stop - offset]
-        # Whole nanoseconds as Python's numbers: in float64 an epoch is off by more than a short spacing.
-        elapsed = [t.item() - self.t0 for t in (times.min(), times.max())]
-        low, high = (x / self.dt for x in elapsed)
-        if not np.isfinite(low + high) or (times.dtype == np.int64 and max(map(abs, elapsed)) >= 2**63):
+        low, high = self.extent(begin - offset, stop - offset)
+        if not np.isfinite(low + high):
             return everything
         start = min(max(int(low) - 1, 0), self.segments - 1)
         end = min(max(int(high) + 2, 1), self.segments) + order - 1
         return first * self.points + start, first * self.points + min(end, self.points)
 
+    def extent(self, begin: int, stop: int) -> tuple[float, float]:
+        """Where the times `begin` to `stop` lie, in knot spacings from the start; NaN where the loops overflow."""
+        times = self.times[begin:stop]
+        # Whole nanoseconds as Python's numbers: in float64 an epoch is off by more than a short spacing.
+        low, high = (t.item() - self.t0 for t in (times.min(), times.max()))
+        if times.dtype == np.int64 and max(abs(low), abs(high)) >= 2**63:
+            return np.nan, np.nan
+        return low / self.dt, high / self.dt
 
-@dataclass(frozen=True)
+
+@dataclass(eq=False)
+class Places(Clock):
+    """Pairs in float64 of a place in a segment, u, and the segment, instead of times; with t0 = 0 and dt = 1 all
+    derivatives are by u."""
+
+    @property
+    def queries(self) -> int:
+        return super().queries // 2
+
+    def extent(self, begin: int, stop: int) -> tuple[float, float]:
+        segments = self.times[2 * begin + 1 : 2 * stop : 2]
+        return segments.min(), segments.max()
+
+
+@dataclass(eq=False)
 class Pairs:
     """What control points alone determine: unit points of continuous sign and logarithms of neighbours, flat."""
 
@@ -78,8 +98,9 @@ class SplineKernels:
         rows: Sequence[Sequence[Fraction]],
         derivatives: int,
         dtype: torch.dtype,
-        nanoseconds: bool,
+        nanoseconds: bool | None,
     ):
+        """`nanoseconds`: whether times are; None: for `Places`."""
         self.group, self.rows, self.derivatives = arithmetic(group), rows, derivatives
         self.dtype, self.nanoseconds = dtype, nanoseconds
         self.real = np.float32 if dtype == torch.float32 else np.float64
@@ -97,16 +118,23 @@ class SplineKernels:
         bad = self._pairs(stored, points, unit, logs, 0, total)
         return Pairs(unit, logs), bad
 
+    def results(self, shape: tuple[int, ...]) -> list[Array]:
+        """Room for what `forward` fills, `(*shape, P or D)`."""
+        return [np.empty((*shape, size), self.real) for size in self.result_sizes]
+
     def forward(self, pairs: Pairs, clock: Clock, outputs: Sequence[Array]) -> int:
         """Fill value and rates (per second); how many times lie outside the domain."""
         total = clock.trajectories * clock.queries
         arguments = (*clock.arguments(), self._scale(clock), *outputs)
-        function, outside = self._forward, []
+        function = self._forward
+        if 0 < total < 2 * SERIAL_BELOW:  # also without what follows, which counts when there are few
+            return function(pairs.unit, pairs.logs, *arguments, 0, total)
+        outside = []
 
         def part(begin: int, stop: int) -> None:
             outside.append(function(pairs.unit, pairs.logs, *arguments, begin, stop))
 
-        parts = torch.get_num_threads() if total >= 2 * SERIAL_BELOW else 1
+        parts = torch.get_num_threads()
         run([partial(part, begin, stop) for begin, stop in spans(total, parts, emit.BLOCK)])
         return sum(outside)
 
@@ -165,8 +193,7 @@ class SplineKernels:
         return gradient
 
     def _scale(self, clock: Clock) -> Array:
-        seconds = clock.dt * 1e-9 if self.nanoseconds else clock.dt
-        return np.array([seconds ** -(r + 1) for r in range(self.derivatives)], dtype=self.real)
+        return _scale(clock.dt * 1e-9 if self.nanoseconds else clock.dt, self.derivatives, self.real)
 
     # ------------------------------------------------------------------ compilation
 
@@ -238,6 +265,12 @@ class SplineKernels:
             self.dtype,
             self.nanoseconds,
         )
+
+
+@lru_cache(256)
+def _scale(seconds: float, derivatives: int, real: type) -> Array:
+    """1/dt, 1/dt^2, ...: only read."""
+    return np.array([seconds ** -(r + 1) for r in range(derivatives)], dtype=real)
 
 
 def _chunk_count(total: int, points: int) -> int:

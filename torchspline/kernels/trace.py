@@ -4,7 +4,7 @@ The arithmetic of a group runs once on `Symbol`s; what remains is a list of oper
 ones numbered alike, constants folded, from which `emit.py` writes a loop. Nothing here knows about groups.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -199,12 +199,15 @@ class Trace(NamedTuple):
     guarded: bool = False
 
     def lines(
-        self, load: Callable[[int], str], constant: Callable[[float], str]
+        self,
+        load: Callable[[int], str],
+        constant: Callable[[float], str],
+        spelling: Mapping[str, str] = SPELLING,
     ) -> tuple[list[str], list[str]]:
         """Assignments in Python, and the expression of each output.
 
         Args:
-            load: how input i is written; constant: how a number is.
+            load: how input i is written; constant: how a number is; spelling: how operations are.
         """
 
         def name(operand: tuple) -> str:
@@ -215,7 +218,7 @@ class Trace(NamedTuple):
             if kind == "input":
                 text = load(operands[0])
             else:
-                text = SPELLING[kind].format(*map(name, operands))
+                text = spelling[kind].format(*map(name, operands))
             body.append(f"v{number} = {text}")
         return body, [name(output) for output in self.outputs]
 

@@ -10,15 +10,14 @@ from torchspline import checks
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import R3, SO3, Group, Side, product
 from torchspline.kernels.mode import usable
-from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, Located, check_float32, locate
-from torchspline.splines.fused import fused_bspline, kernels_of
+from torchspline.splines.clock import EXTRAPOLATE, Extrapolate, check_float32, locate
+from torchspline.splines.fused import fused_bspline, kernels_of, small
 from torchspline.splines.jacobians import Jacobians, bspline_jacobians
+from torchspline.splines.segments import past_the_end
 from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
 
 _NANOSECOND = 1e-9
-#: Largest order times dimension for which a kernel is compiled: beyond, straight-line code takes minutes to compile.
-_SMALL = 64
 
 
 def bspline(
@@ -75,7 +74,7 @@ def bspline(
         u = place.u.to(control_points.dtype)
         fields = cumulative_bspline(control_points, u, place.segment, group.name, order, needed)
         if place.beyond is not None:
-            fields = _beyond(group, fields, place, extrapolate)
+            fields = past_the_end(group, fields, place.beyond.to(u.dtype), extrapolate)
         seconds = spacing * _NANOSECOND if times.dtype == torch.int64 else spacing
         return tuple(
             field if r == 0 else field / seconds**r for r, field in enumerate(fields[: derivatives + 1])
@@ -84,7 +83,7 @@ def bspline(
     fields = None
     # Asked first: Dynamo cannot trace the context variable that `usable` reads.
     eager = not torch.compiler.is_compiling()
-    if eager and order * group.tangent_size <= _SMALL and usable(control_points, times, start, spacing):
+    if eager and small(group.name, order) and usable(control_points, times, start, spacing):
         kernels = kernels_of(group.name, order, derivatives, control_points.dtype, times.dtype == torch.int64)
         if validate:
             check_float32(times, spacing)
@@ -132,7 +131,7 @@ def _check_control_points(control_points: Tensor, group: Group, order: int) -> N
 
 def _check_values(control_points: Tensor, group: Group) -> None:
     checks.finite("control_points", control_points)
-    checks.quaternions("control_points", control_points, group.arithmetic.sign_blocks)
+    checks.quaternions("control_points", control_points, group.arithmetic.unit_blocks)
 
 
 def _knots(t: Tensor, dt: Any, t0: Any, dt_ns: Any, t0_ns: Any) -> tuple[Any, Any]:
@@ -175,7 +174,7 @@ def _seconds(name: str, x: Any, t: Tensor, check: Callable[[str, float], float])
             )
         if (number := checks.seen_number(x)) is not None:
             check(name, number)
-        return x.to(torch.float64)
+        return x if x.dtype == torch.float64 else x.to(torch.float64)
     if isinstance(x, bool) or not isinstance(x, (int, float)):
         raise TypeError(f"{name}: expected seconds as a number or a 0-dim tensor, got {type(x).__name__}")
     return check(name, float(x))
@@ -204,23 +203,6 @@ def _align(control_points: Tensor, t: Tensor) -> tuple[Tensor, Tensor, tuple[int
     return expanded, t.expand(*common, t.shape[-1]), (*common, t.shape[-1])
 
 
-def _beyond(
-    group: Group, fields: tuple[Tensor, ...], place: Located, extrapolate: Extrapolate
-) -> tuple[Tensor, ...]:
-    """Past an end: hold the pose, or keep the velocity there."""
-    assert place.beyond is not None
-    value, *rates = fields
-    excess = place.beyond.to(value.dtype).unsqueeze(-1)
-    outside = excess != 0
-    if extrapolate == "linear":
-        drift = group.exp(excess * rates[0], validate=False)
-        value = group.compose(value, drift, validate=False)
-        held = [rates[0]]
-    else:
-        held = []
-    return value, *held, *(torch.where(outside, 0.0, rate) for rate in rates[len(held) :])
-
-
 class BSpline(Trajectory):
     """A uniform cumulative B-spline as a layer: control points in, motion at any time out. See `bspline`.
 
@@ -233,6 +215,8 @@ class BSpline(Trajectory):
         dt_ns, t0_ns: whole nanoseconds instead; times are then int64.
         learnable: whether control points that do not require grad become a `Parameter`.
     """
+
+    _times = ("dt", "t0")
 
     def __init__(
         self,
@@ -255,12 +239,7 @@ class BSpline(Trajectory):
         checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
         self.order, self.extrapolate, self.validate = order, extrapolate, validate
         self.control_points: Tensor
-        if not control_points.requires_grad and not isinstance(control_points, nn.Parameter):
-            # A copy: an optimiser's step must not reach the caller's numbers, which may be an expanded view, too.
-            control_points = control_points.clone(memory_format=torch.contiguous_format)
-            if learnable:
-                control_points = nn.Parameter(control_points)
-        self._keep("control_points", control_points)
+        self._adopt("control_points", control_points, learnable)
         nanoseconds = dt_ns is not None or t0_ns is not None
         probe = torch.zeros(
             (), dtype=torch.int64 if nanoseconds else torch.float64, device=control_points.device
@@ -274,25 +253,6 @@ class BSpline(Trajectory):
                 if not isinstance(x, nn.Parameter) and not (isinstance(x, Tensor) and x.requires_grad):
                     x = torch.as_tensor(x, dtype=torch.float64, device=control_points.device).clone()
                 self._keep(name, x)
-
-    def _apply(self, fn: Any, recurse: bool = True) -> "BSpline":
-        """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
-        times: dict[str, Tensor] = {n: x for n in ("dt", "t0") if (x := getattr(self, n)) is not None}
-        # A Parameter is converted in place: only other tensors on the same memory still have its numbers then.
-        numbers = {name: x.detach() for name, x in times.items()}
-        learnt = {name: x for name, x in times.items() if isinstance(x, nn.Parameter)}
-        grads = {name: x.grad.detach() for name, x in learnt.items() if x.grad is not None}
-        super()._apply(fn, recurse)
-        for name, before in times.items():
-            new = getattr(self, name)
-            if new.dtype == numbers[name].dtype:
-                continue
-            if isinstance(new, nn.Parameter):
-                new.data = numbers[name].to(new.device)
-                new.grad = grads[name].to(new.device) if name in grads else None
-            else:
-                setattr(self, name, before.to(new.device))
-        return self
 
     def get_extra_state(self) -> Tensor:
         """Whole nanoseconds [t0, dt], zeros for seconds: plain numbers for `torch.compile`, but state all the same."""

@@ -1,21 +1,44 @@
-"""The uniform B-spline through compiled kernels: one call forward, one call backward."""
+"""The uniform B-spline through compiled kernels: one call forward, one call backward.
 
-from collections.abc import Callable
+On the CPU a loop does all of it, from times on (`fused_bspline`). Where times have become segments and places within
+them, as on a GPU and in compiled graphs, `placed_kernels` finds what does the rest.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from torchspline.kernels.mode import RefusedError, batched, flat, transformed
-from torchspline.kernels.spline import Clock, SplineKernels
+from torchspline.arithmetic.registry import arithmetic
+from torchspline.kernels.build import available
+from torchspline.kernels.mode import (
+    RefusedError,
+    batched,
+    current,
+    flat,
+    plain,
+    transformed,
+    triton_available,
+)
+from torchspline.kernels.spline import Clock, Places, SplineKernels
+from torchspline.kernels.triton import TritonSpline
 from torchspline.splines.basis import cumulative_matrix
 from torchspline.splines.clock import tolerance
 
+#: Largest order times dimension for which a kernel is compiled: beyond, straight-line code takes minutes to compile.
+_SMALL = 64
 
-@dataclass(frozen=True)
+
+def small(group: str, order: int) -> bool:
+    """Whether a problem is small enough to compile a kernel for it."""
+    return order * arithmetic(group).tangent_size <= _SMALL
+
+
+@dataclass(eq=False)
 class Call:
     """What does not change hands as a tensor: sizes, knots as numbers, and the same computation by the reference."""
 
@@ -60,7 +83,7 @@ def fused_bspline(
     start, spacing = _number(t0), _number(dt)
     slack = float(tolerance(t, start, spacing, segments)) if validate else None
     call = Call(kernels, segments, start, spacing, slack, reference)
-    times = t if t.dtype == torch.int64 else t.to(torch.float64)
+    times = t.to(torch.float64) if t.dtype == torch.float32 else t
     try:
         return FusedBSpline.apply(control_points, times, _learnt(t0), _learnt(dt), call)
     except RefusedError:
@@ -77,10 +100,16 @@ def _learnt(x: Tensor | float | int) -> Tensor | None:
 
 @cache
 def kernels_of(
-    group: str, order: int, derivatives: int, dtype: torch.dtype, nanoseconds: bool
+    group: str, order: int, derivatives: int, dtype: torch.dtype, nanoseconds: bool | None
 ) -> SplineKernels:
     """One set of kernels for each combination in a process."""
     return SplineKernels(group, cumulative_matrix(order)[1:], derivatives, dtype, nanoseconds)
+
+
+@cache
+def triton_kernels_of(group: str, order: int, derivatives: int, dtype: torch.dtype) -> TritonSpline:
+    """One set of kernels for each combination in a process."""
+    return TritonSpline(group, cumulative_matrix(order)[1:], derivatives, dtype)
 
 
 class FusedBSpline(Function):
@@ -98,12 +127,11 @@ class FusedBSpline(Function):
         pairs, bad = call.kernels.pairs(flat(control_points), clock.trajectories, clock.points)
         if bad and call.tolerance is not None:
             raise RefusedError
-        sizes = call.kernels.result_sizes
-        outputs = tuple(control_points.new_empty(*batch, t.shape[-1], size) for size in sizes)
-        outside = call.kernels.forward(pairs, clock, [flat(x) for x in outputs])
-        if outside:
+        results = call.kernels.results((*batch, t.shape[-1]))
+        if call.kernels.forward(pairs, clock, [x.reshape(-1) for x in results]):
             raise RefusedError
-        ctx.call, ctx.pairs = call, pairs
+        outputs = tuple(map(torch.from_numpy, results))
+        ctx.call, ctx.clock, ctx.pairs = call, clock, pairs
         ctx.save_for_backward(control_points, t, t0, dt)
         # Not saved for backward: there, writing to a result in place would be an error, which it is not elsewhere.
         ctx.results = tuple(x.detach() for x in (outputs[:1] if dt is None else outputs))
@@ -123,9 +151,9 @@ class FusedBSpline(Function):
             control_points.new_zeros(*shape, size) if c is None else c
             for c, size in zip(cotangents, sizes, strict=True)
         ]
-        clock = call.clock(control_points, t)
         value, value_g, *rates_g = map(flat, (results[0], *filled))
-        stored_g, u_g = call.kernels.reverse(flat(control_points), ctx.pairs, clock, value, value_g, rates_g)
+        stored = flat(control_points)
+        stored_g, u_g = call.kernels.reverse(stored, ctx.pairs, ctx.clock, value, value_g, rates_g)
         t_g = None
         if any(ctx.needs_input_grad[1:4]):
             t_g = torch.from_numpy(u_g).reshape(shape).to(torch.float64) / call.dt
@@ -166,3 +194,77 @@ def _through_reference(
             )
         )
     return [next(gradients) if x is not None and x.requires_grad else None for x in saved]
+
+
+class PlacedKernels(Protocol):
+    """Sweeps at `u` and `index`, places in segments and segments, `(N,)` or `(*batch, N)`; derivatives are by u."""
+
+    def forward(self, control_points: Tensor, u: Tensor, index: Tensor) -> list[Tensor]:
+        """Value and rates, `(*batch, N, P or D)`."""
+
+    def reverse(
+        self, control_points: Tensor, u: Tensor, index: Tensor, cotangents: Sequence[Tensor | None]
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients of control points and u."""
+
+
+class _OnCPU:
+    """`SplineKernels` as `PlacedKernels`."""
+
+    def __init__(self, kernels: SplineKernels):
+        self.kernels = kernels
+
+    def forward(self, control_points: Tensor, u: Tensor, index: Tensor) -> list[Tensor]:
+        return self._forward(control_points, self._places(control_points, u, index))[1]
+
+    def reverse(
+        self, control_points: Tensor, u: Tensor, index: Tensor, cotangents: Sequence[Tensor | None]
+    ) -> tuple[Tensor, Tensor]:
+        places = self._places(control_points, u, index)
+        pairs, results = self._forward(control_points, places)
+        given = [torch.zeros_like(x) if g is None else g for g, x in zip(cotangents, results, strict=True)]
+        value, value_g, *rates_g = map(flat, (results[0], *given))
+        stored_g, u_g = self.kernels.reverse(flat(control_points), pairs, places, value, value_g, rates_g)
+        per_query = torch.from_numpy(u_g).reshape(results[0].shape[:-1])
+        return torch.from_numpy(stored_g).reshape(control_points.shape), per_query.sum_to_size(u.shape)
+
+    def _forward(self, control_points: Tensor, places: Places) -> tuple[Any, list[Tensor]]:
+        pairs, _ = self.kernels.pairs(flat(control_points), places.trajectories, places.points)
+        results = self.kernels.results((*control_points.shape[:-2], places.queries))
+        self.kernels.forward(pairs, places, [x.reshape(-1) for x in results])
+        return pairs, list(map(torch.from_numpy, results))
+
+    def _places(self, control_points: Tensor, u: Tensor, index: Tensor) -> Places:
+        pairs = torch.stack([u.detach().to(torch.float64), index.to(torch.float64)], dim=-1)
+        points = control_points.shape[-2]
+        trajectories = control_points.shape[:-2].numel()
+        segments = points - self.kernels.order + 1
+        return Places(flat(pairs), u.ndim == 1, 0.0, 1.0, float("inf"), segments, points, trajectories)
+
+
+def _on_cpu(
+    device: torch.device, group: str, order: int, derivatives: int, dtype: torch.dtype
+) -> PlacedKernels | None:
+    return _OnCPU(kernels_of(group, order, derivatives, dtype, None)) if available() else None
+
+
+def _on_gpu(
+    device: torch.device, group: str, order: int, derivatives: int, dtype: torch.dtype
+) -> PlacedKernels | None:
+    return triton_kernels_of(group, order, derivatives, dtype) if triton_available(device) else None
+
+
+#: By type of device. A new kind of kernel is a line here.
+ENGINES: dict[str, Callable[..., PlacedKernels | None]] = {"cpu": _on_cpu, "cuda": _on_gpu}
+
+
+def placed_kernels(
+    control_points: Tensor, u: Tensor, index: Tensor, group: str, order: int, derivatives: int
+) -> PlacedKernels | None:
+    """Kernels for a call with these tensors, or None where the reference has to do it."""
+    engine = ENGINES.get(control_points.device.type)
+    if engine is None or current() == "reference" or not small(group, order):
+        return None
+    if not plain(control_points, u, index):
+        return None
+    return engine(control_points.device, group, order, derivatives, control_points.dtype)

@@ -28,7 +28,9 @@ from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import Vector, times, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.nested import outer_levels, primals
+from torchspline.kernels.mode import batched
 from torchspline.splines.basis import cumulative_weights
+from torchspline.splines.fused import placed_kernels
 
 
 class _Pairs(NamedTuple):
@@ -209,6 +211,33 @@ def _tangent(
     return tuple(join(x, like) for x in (algebra.push(queries.value, xi), *rates))
 
 
+def _run(
+    control_points: Tensor, u: Tensor, index: Tensor, group: str, order: int, derivatives: int
+) -> tuple[Tensor, ...]:
+    """The forward sweep by a kernel, or else by tensor operations."""
+    kernels = placed_kernels(control_points, u, index, group, order, derivatives)
+    if kernels is not None:
+        return tuple(kernels.forward(control_points, u, index))
+    return _forward(control_points, u, index, group, order, derivatives)
+
+
+def _run_reverse(
+    control_points: Tensor,
+    u: Tensor,
+    index: Tensor,
+    group: str,
+    order: int,
+    cotangents: tuple[Tensor | None, ...],
+    u_needed: bool,
+) -> tuple[Tensor, Tensor | None]:
+    """The reverse sweep by a kernel, or else by tensor operations, which alone can be differentiated again."""
+    if not torch.is_grad_enabled() and not any(map(batched, cotangents)):
+        kernels = placed_kernels(control_points, u, index, group, order, len(cotangents) - 1)
+        if kernels is not None:
+            return kernels.reverse(control_points, u, index, cotangents)
+    return _reverse(control_points, u, index, group, order, cotangents, u_needed)
+
+
 class CumulativeBSpline(Function):
     """Value and derivatives by u: (value, velocity, ...), each `(*batch, N, P or D)`."""
 
@@ -218,7 +247,7 @@ class CumulativeBSpline(Function):
     def forward(
         control_points: Tensor, u: Tensor, index: Tensor, group: str, order: int, derivatives: int
     ) -> tuple[Tensor, ...]:
-        return _forward(control_points, u, index, group, order, derivatives)
+        return _run(control_points, u, index, group, order, derivatives)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -233,7 +262,7 @@ class CumulativeBSpline(Function):
             return (None,) * 6
         control_points, u, index = ctx.saved_tensors
         u_needed = ctx.needs_input_grad[1]
-        gradients = _reverse(control_points, u, index, ctx.group, ctx.order, cotangents, u_needed)
+        gradients = _run_reverse(control_points, u, index, ctx.group, ctx.order, cotangents, u_needed)
         return *gradients, None, None, None, None
 
     @staticmethod
@@ -249,14 +278,16 @@ class CumulativeBSpline(Function):
 def _compiled(
     control_points: Tensor, u: Tensor, index: Tensor, group: str, order: int, derivatives: int
 ) -> list[Tensor]:
-    return list(_forward(control_points, u, index, group, order, derivatives))
+    return list(_run(control_points, u, index, group, order, derivatives))
 
 
 @torch.library.custom_op("torchspline::bspline_reverse", mutates_args=())
 def _compiled_reverse(
     control_points: Tensor, u: Tensor, index: Tensor, group: str, order: int, cotangents: list[Tensor]
 ) -> list[Tensor]:
-    control_gradient, u_gradient = _reverse(control_points, u, index, group, order, tuple(cotangents), True)
+    with torch.no_grad():  # nothing below records a graph, whatever the mode says
+        gradients = _run_reverse(control_points, u, index, group, order, tuple(cotangents), True)
+    control_gradient, u_gradient = gradients
     assert u_gradient is not None
     return [control_gradient, u_gradient]
 

@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchspline import checks
-from torchspline.groups.group import SE3, SO3, Group
+from torchspline.groups.convert import pose_from_dual_quaternion, pose_to_dual_quaternion
+from torchspline.groups.group import SE3, SO3, DualQuaternion, Group
 
 
 class State(NamedTuple):
@@ -22,6 +23,27 @@ class State(NamedTuple):
     velocity: Tensor | None = None
     acceleration: Tensor | None = None
     jerk: Tensor | None = None
+
+
+def to_world_frame(state: State, group: Group) -> State:
+    """The same derivatives in the world frame, `dX/dt X^-1` and its derivatives by time, as [E17] has them.
+
+    Ad_X carries velocity and acceleration across, and jerk once `[velocity, acceleration]` is added.
+    """
+    X, v, a, j = state
+    if j is not None and v is not None and a is not None:
+        j = j + group.bracket(v, a, validate=False)
+    return State(X, *(None if r is None else group.adjoint_act(X, r, validate=False) for r in (v, a, j)))
+
+
+def to_body_frame(state: State, group: Group) -> State:
+    """Inverse of `to_world_frame`."""
+    X, *rates = state
+    back = group.inverse(X, validate=False)
+    v, a, j = (None if r is None else group.adjoint_act(back, r, validate=False) for r in rates)
+    if j is not None and v is not None and a is not None:
+        j = j - group.bracket(v, a, validate=False)
+    return State(X, v, a, j)
 
 
 class Kinematics(NamedTuple):
@@ -67,12 +89,17 @@ def _of_se3(s: State) -> Kinematics:
     return Kinematics(q, s.value[..., :3], velocity, acceleration, w, a[..., 3:])
 
 
+def _of_dual_quaternion(s: State) -> Kinematics:
+    return _of_se3(s._replace(value=pose_from_dual_quaternion(s.value)))
+
+
 #: How the states of a group read as motion; a group that moves a rigid body adds its line here and in `_ATTACH`.
 MECHANICS: dict[str, Callable[[State], Kinematics]] = {
     "SO3": _of_so3,
     "R3": _of_r3,
     "R3xSO3": _of_split,
     "SE3": _of_se3,
+    "DualQuaternion": _of_dual_quaternion,
 }
 
 
@@ -81,6 +108,8 @@ class Trajectory(nn.Module, ABC):
 
     #: The group its values live in.
     group: Group
+    #: Names of what it keeps in seconds: tensors, Parameters or None, float64 whatever the module is converted to.
+    _times: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -99,6 +128,33 @@ class Trajectory(nn.Module, ABC):
         else:
             self.register_buffer(name, x)
 
+    def _adopt(self, name: str, x: Tensor, learnable: bool) -> None:
+        """Keep `x` as given if it carries a graph or is a `Parameter`, else a copy: a `Parameter` if `learnable`."""
+        if not x.requires_grad and not isinstance(x, nn.Parameter):
+            x = x.clone(memory_format=torch.contiguous_format)
+            if learnable:
+                x = nn.Parameter(x)
+        self._keep(name, x)
+
+    def _apply(self, fn: Any, recurse: bool = True) -> "Trajectory":
+        """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
+        times: dict[str, Tensor] = {n: x for n in self._times if (x := getattr(self, n)) is not None}
+        # A Parameter is converted in place: only other tensors on the same memory still have its numbers then.
+        numbers = {name: x.detach() for name, x in times.items()}
+        learnt = {name: x for name, x in times.items() if isinstance(x, nn.Parameter)}
+        grads = {name: x.grad.detach() for name, x in learnt.items() if x.grad is not None}
+        super()._apply(fn, recurse)
+        for name, before in times.items():
+            new = getattr(self, name)
+            if new.dtype == numbers[name].dtype:
+                continue
+            if isinstance(new, nn.Parameter):
+                new.data = numbers[name].to(new.device)
+                new.grad = grads[name].to(new.device) if name in grads else None
+            else:
+                setattr(self, name, before.to(new.device))
+        return self
+
     def forward(self, t: Tensor) -> Tensor:
         """Values at the times `t`, `(*batch, N, P)`."""
         return self.evaluate(t, derivatives=0).value
@@ -107,7 +163,7 @@ class Trajectory(nn.Module, ABC):
         """Rotation, position and their rates at the times `t`.
 
         Raises:
-            ValueError: the group is not one of SO3, R3, R3xSO3, SE3.
+            ValueError: the group is not one of SO3, R3, R3xSO3, SE3, DualQuaternion.
         """
         if self.group.name not in MECHANICS:
             raise ValueError(
@@ -168,11 +224,15 @@ class Mounted(Trajectory):
         return _ATTACH[self.group.name](state, T)
 
 
-def _attach_se3(s: State, T: Tensor) -> State:
+def _attach_se3(s: State, T: Tensor, group: Group = SE3) -> State:
     """T is constant, so every rate is just seen from the other frame: Ad_{T^-1}."""
-    back = SE3.inverse(T, validate=False)
-    rates = (None if r is None else SE3.adjoint_act(back, r, validate=False) for r in s[1:])
-    return State(SE3.compose(s.value, T, validate=False), *rates)
+    back = group.inverse(T, validate=False)
+    rates = (None if r is None else group.adjoint_act(back, r, validate=False) for r in s[1:])
+    return State(group.compose(s.value, T, validate=False), *rates)
+
+
+def _attach_dual_quaternion(s: State, T: Tensor) -> State:
+    return _attach_se3(s, pose_to_dual_quaternion(T), DualQuaternion)
 
 
 def _attach_so3(s: State, T: Tensor) -> State:
@@ -212,4 +272,5 @@ _ATTACH: dict[str, Callable[[State, Tensor], State]] = {
     "SO3": _attach_so3,
     "R3xSO3": _attach_split,
     "SE3": _attach_se3,
+    "DualQuaternion": _attach_dual_quaternion,
 }

@@ -1,0 +1,423 @@
+"""Quintic Hermite splines on any Lie group, [E17]: value, velocity and acceleration given at every knot, C2.
+
+Two curves between the same ends, the same on a commutative group:
+
+* `coordinates="product"`, [E17] (59)-(81): `X_0 Exp(a_1 p_1) ... Exp(a_5 p_5)` with p_1 = Log(X_0^-1 X_1), p_2
+  and p_3 the velocities, p_4 and p_5 the accelerations at the ends. Third order where the factors do not
+  commute (a smooth motion sampled h apart is met to h^3, its velocity to h^2, its acceleration to h);
+* `coordinates="logarithm"`: `X_0 Exp(phi)` with one quintic phi in the tangent space of X_0. Sixth order.
+
+[E17] multiplies on the left and differentiates in the world frame; here products and rates are those of the body frame,
+which is [E17] applied to the inverse motion. `frame="world"` is [E17] to the letter.
+"""
+
+from fractions import Fraction
+from math import factorial
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchspline import checks
+from torchspline.arithmetic import jet
+from torchspline.arithmetic.recurrence import MAX_DERIVATIVES, difference_reverse, forward, reverse
+from torchspline.arithmetic.vector import Vector, add, scale, zero
+from torchspline.groups.components import join, split
+from torchspline.groups.group import Group, Side
+from torchspline.groups.operations import geodesics
+from torchspline.splines.clock import Extrapolate
+from torchspline.splines.segments import (
+    Curve,
+    check_knot_times,
+    check_query,
+    evaluate_segments,
+    locate_between,
+    rows_at,
+)
+from torchspline.splines.sweep import continue_signs, first, second
+from torchspline.splines.trajectory import State, Trajectory, to_body_frame, to_world_frame
+
+Coordinates = Literal["product", "logarithm"]
+Frame = Literal["body", "world"]
+
+_HALF = Fraction(1, 2)
+#: [E17] (60)-(65): a_1 ... a_5 by powers of u. Each is one of value, velocity and acceleration at an end and
+#: zero in the
+#: others: a_1 the value at 1, a_2 and a_3 the velocity at 0 and 1, a_4 and a_5 the acceleration.
+QUINTICS: tuple[tuple[Fraction | int, ...], ...] = (
+    (0, 0, 0, 10, -15, 6),
+    (0, 1, 0, -6, 8, -3),
+    (0, 0, 0, -4, 7, -3),
+    (0, 0, _HALF, -3 * _HALF, 3 * _HALF, -_HALF),
+    (0, 0, 0, _HALF, -1, _HALF),
+)
+
+
+def _columns(derivatives: int) -> list[list[list[float]]]:
+    table, rows = [], [list(map(Fraction, row)) for row in QUINTICS]
+    for _ in range(derivatives + 1):
+        table.append(rows)
+        rows = [[*(n * c for n, c in enumerate(row) if n > 0), Fraction(0)] for row in rows]
+    return [[[float(row[n]) for row in rows] for rows in table] for n in range(len(QUINTICS[0]))]
+
+
+#: For each number of derivatives, coefficients by power of u, then by derivative, then by j.
+_COLUMNS = [_columns(derivatives) for derivatives in range(MAX_DERIVATIVES + 1)]
+
+
+def quintic_weights(u: Tensor, derivatives: int) -> Tensor:
+    """a_1 ... a_5 and their derivatives by u: `(*u.shape, derivatives + 1, 5)`."""
+    columns = torch.tensor(_COLUMNS[derivatives], dtype=u.dtype, device=u.device)
+    u = u[..., None, None]
+    value = columns[-1].expand(*u.shape[:-2], -1, -1)
+    for column in reversed(columns[:-1].unbind(0)):
+        value = value * u + column
+    return value
+
+
+class _Ends(NamedTuple):
+    """Both ends of segments: unit points of consistent sign, and rates by u, in the body frame."""
+
+    X0: Tensor
+    X1: Tensor
+    v0: Tensor
+    v1: Tensor
+    a0: Tensor
+    a1: Tensor
+
+
+def _ends(values: Tensor, velocities: Tensor, accelerations: Tensor, times: Tensor, group: Group) -> _Ends:
+    algebra = group.arithmetic
+    unit = algebra.normalize(split(values))
+    between = algebra.between(first(unit), second(unit))
+    points = join(continue_signs(algebra, unit, between), values)
+    h = times.to(torch.float64).diff().to(values.dtype).unsqueeze(-1)
+    pairs = []
+    for x, factor in ((points, None), (velocities, h), (accelerations, h * h)):
+        for side in (x[..., :-1, :], x[..., 1:, :]):
+            pairs.append(side if factor is None else side * factor)
+    return _Ends(*pairs)
+
+
+def _table(ends: _Ends, group: Group, coordinates: Coordinates) -> Tensor:
+    """For every segment the start and five tangents: `(..., P + 5 D)`."""
+    algebra = group.arithmetic
+    X0, X1, v0, v1, a0, a1 = ends
+    step = group.log(group.between(X0, X1, validate=False), validate=False)
+    if coordinates == "logarithm":
+        # phi' = J_r^-1(phi) w at the end, and phi'' its derivative along phi' with w' = a.
+        p, w, a = split(step), split(v1), split(a1)
+        slope = algebra.right_jacobian_inverse(p, w, short=True)
+        moving = tuple(map(jet.Jet, p, slope)), tuple(map(jet.Jet, w, a))
+        v1 = join(slope, step)
+        a1 = join(jet.values(algebra.right_jacobian_inverse(*moving, short=True), 1), step)
+    return torch.cat([X0, step, v0, v1, a0, a1], dim=-1)
+
+
+def _fields(
+    rows: Tensor, u: Tensor, group: Group, coordinates: Coordinates, derivatives: int
+) -> tuple[Tensor, ...]:
+    """Value and rates by u from rows (..., P + 5 D) of the table; u broadcasts."""
+    start, steps = rows[..., : group.point_size], rows[..., group.point_size :]
+    weights = quintic_weights(u, derivatives)
+    if coordinates == "product":
+        return geodesics(group.name, start, steps.unflatten(-1, (5, group.tangent_size)), weights)
+    algebra = group.arithmetic
+    tangents = [split(x) for x in steps.split(group.tangent_size, dim=-1)]
+    taylor = []
+    for r, row in enumerate(weights.unbind(-2)):
+        terms = (scale(a / factorial(r), p) for a, p in zip(row.unbind(-1), tangents, strict=True))
+        taylor.append(add(*terms))
+    x = tuple(map(jet.Jet, *taylor))
+    value = algebra.compose(split(start), algebra.exp(jet.values(x, 0)))
+    return tuple(join(field, rows) for field in (value, *jet.logarithmic_rates(algebra, x, derivatives)))
+
+
+def _from_world(
+    values: Tensor, velocities: Tensor, accelerations: Tensor, group: Group
+) -> tuple[Tensor, ...]:
+    """The inverse motion, whose body-frame rates are the world-frame rates of this one, negated."""
+    return group.inverse(values, validate=False), -velocities, -accelerations
+
+
+def hermite(
+    values: Tensor,
+    velocities: Tensor,
+    accelerations: Tensor,
+    t: Tensor,
+    *,
+    group: Group,
+    times: Tensor,
+    coordinates: Coordinates = "product",
+    frame: Frame = "body",
+    derivatives: int = 2,
+    extrapolate: Extrapolate = "error",
+    validate: bool = True,
+) -> State:
+    """Value and time derivatives of a quintic Hermite spline, [E17] section 5. O(1) per query.
+
+    Args:
+        values: `(*batch, M, P)` points of `group` at the knots, M >= 2; quaternions of any length and sign,
+            neighbours are joined the short way round.
+        velocities, accelerations: `(*batch, M, D)` at the knots, per second and per second squared.
+        t: `()`, `(N,)` or `(*batch, N)` seconds within the knots; float32 only while its rounding stays below a
+            thousandth of the shortest segment.
+        times: `(M,)` seconds of the knots, increasing, uniform or not.
+        coordinates: "product", the product of geodesics of [E17] (59), third order; "logarithm", one quintic in the
+            logarithm, sixth order. See the module.
+        frame: of velocities and accelerations at the knots, and of the product: "body" or, as in [E17], "world".
+        derivatives, extrapolate, validate: as in `bspline`.
+    Returns:
+        State: as of `bspline`; rates are in the body frame whatever `frame` is.
+    Differentiable in values, velocities, accelerations, times and float `t`, to any order; derivatives above the second
+    jump at knots.
+    Raises:
+        TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
+    """
+    checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
+    _check_knots(values, velocities, accelerations, times, group, coordinates, frame, validate)
+    check_query(t, derivatives, extrapolate, validate, values, values=values.shape[:-2])
+    knots = (values, velocities, accelerations)
+    state = _evaluate(knots, t, group, times, coordinates, frame, derivatives, extrapolate, validate)
+    return to_body_frame(state, group) if frame == "world" else state
+
+
+def _evaluate(
+    knots: tuple[Tensor, Tensor, Tensor],
+    t: Tensor,
+    group: Group,
+    times: Tensor,
+    coordinates: Coordinates,
+    frame: Frame,
+    derivatives: int,
+    extrapolate: Extrapolate,
+    validate: bool,
+) -> State:
+    """The state with rates in `frame`."""
+    if frame == "world":
+        knots = _from_world(*knots, group)  # type: ignore[assignment]
+    table = _table(_ends(*knots, times, group), group, coordinates)
+    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
+
+    def curve(common: torch.Size) -> Curve:
+        expanded = table.expand(*common, *table.shape[-2:])
+        return lambda segment, u: _fields(rows_at(expanded, segment), u, group, coordinates, needed)
+
+    state = evaluate_segments(
+        curve, group, t, times, values_batch(knots[0]), knots[0].dtype, derivatives, extrapolate, validate
+    )
+    if frame == "body":
+        return state
+    value = group.inverse(state.value, validate=False)
+    return State(value, *(None if r is None else -r for r in state[1:]))
+
+
+def values_batch(values: Tensor) -> torch.Size:
+    return values.shape[:-2]
+
+
+def _check_knots(
+    values: Tensor,
+    velocities: Tensor,
+    accelerations: Tensor,
+    times: Tensor,
+    group: Group,
+    coordinates: str,
+    frame: str,
+    validate: bool,
+) -> None:
+    checks.choice("coordinates", coordinates, ("product", "logarithm"))
+    checks.choice("frame", frame, ("body", "world"))
+    checks.points("values", values, group, least=2, look=validate)
+    for name, x in (("velocities", velocities), ("accelerations", accelerations)):
+        checks.is_floating_tensor(name, x)
+        expected = (*values.shape[:-1], group.tangent_size)
+        if x.shape != expected:
+            raise ValueError(
+                f"{name}: expected shape {expected}, tangents of {group} at the knots, got {tuple(x.shape)}"
+            )
+        checks.same_kind(values=values, **{name: x})
+        if validate:
+            checks.finite(name, x)
+    check_knot_times(times, values.shape[-2])
+    if times.device != values.device:
+        raise ValueError(
+            f"times: on device {times.device}, but values are on {values.device}; move one with .to(device)"
+        )
+
+
+class Differentials(NamedTuple):
+    """Jacobians of a Hermite spline at N times by the knots at the ends of their segments.
+
+    `segment` (*batch, N): knot i and i + 1 are those of segment i. `jacobian` (*batch, N, 3, 6, D, D): of
+        value, velocity
+    and acceleration (third to last but one dimension) by value, velocity and acceleration of the knots, in the order
+    X_i, X_(i+1), v_i, v_(i+1), a_i, a_(i+1); rows belong to the output, columns to the parameter.
+    """
+
+    segment: Tensor
+    jacobian: Tensor
+
+
+class HermiteSpline(Trajectory):
+    """A quintic Hermite spline as a layer: value, velocity and acceleration at knots in, motion at any time out.
+
+    Args:
+        values: `(*batch, M, P)`; velocities, accelerations: `(*batch, M, D)`; see `hermite`. Tensors that
+            require grad and Parameters are used as given, others copied into Parameters, or buffers if not
+            `learnable`.
+        group, coordinates, frame, extrapolate, validate: as in `hermite`.
+        times: `(M,)` seconds, kept in float64; a tensor that requires grad is used as given.
+        learnable: whether tensors that do not require grad become Parameters; never the times.
+    """
+
+    _times = ("times",)
+
+    def __init__(
+        self,
+        values: Tensor,
+        velocities: Tensor,
+        accelerations: Tensor,
+        *,
+        group: Group,
+        times: Tensor,
+        coordinates: Coordinates = "product",
+        frame: Frame = "body",
+        learnable: bool = True,
+        extrapolate: Extrapolate = "error",
+        validate: bool = True,
+    ):
+        super().__init__()
+        checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
+        _check_knots(values, velocities, accelerations, times, group, coordinates, frame, True)
+        checks.choice("extrapolate", extrapolate, ("error", "clamp", "linear"))
+        self.group, self.coordinates, self.frame = group, coordinates, frame
+        self.extrapolate, self.validate = extrapolate, validate
+        self.values: Tensor
+        self.velocities: Tensor
+        self.accelerations: Tensor
+        self.times: Tensor
+        self._adopt("values", values, learnable)
+        self._adopt("velocities", velocities, learnable)
+        self._adopt("accelerations", accelerations, learnable)
+        if not isinstance(times, nn.Parameter) and not times.requires_grad:
+            times = times.to(torch.float64)
+        self._adopt("times", times, learnable=False)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """First and last knot, seconds."""
+        return self.times[0].item(), self.times[-1].item()
+
+    def evaluate(self, t: Tensor, derivatives: int = 2, frame: Frame = "body") -> State:
+        """Value and time derivatives at the times `t`, see `hermite`; rates in the body frame, or in the world frame
+        (`dX/dt X^-1` and its derivatives, as in [E17] (33), (36))."""
+        checks.choice("frame", frame, ("body", "world"))
+        check_query(
+            t, derivatives, self.extrapolate, self.validate, self.values, values=values_batch(self.values)
+        )
+        state = _evaluate(
+            self._knots, t, self.group, self.times, self.coordinates, self.frame, derivatives, self.extrapolate,
+            self.validate,
+        )  # fmt: skip
+        if frame == self.frame:
+            return state
+        return (to_world_frame if frame == "world" else to_body_frame)(state, self.group)
+
+    @property
+    def _knots(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.values, self.velocities, self.accelerations
+
+    def differentials(self, t: Tensor, side: Side = "left") -> Differentials:
+        """Jacobians of value, velocity and acceleration by the knots, [E17] (39)-(52) and (93)-(100), correcting its
+        (95), (96), which say C for B. O(1) per query, no graph.
+
+        Args:
+            t: `(N,)` or `(*batch, N)` seconds inside the domain.
+            side: of perturbations of values, at the knots and of the result: `X <- Exp(delta) X` ("left") or
+                `X Exp(delta)`. Rates, of knots and results, are those in the spline's own `frame`.
+        Raises:
+            ValueError: a time outside the domain.
+        """
+        checks.choice("side", side, ("left", "right"))
+        check_query(t, 2, "error", True, self.values, values=values_batch(self.values))
+        group, knots, times = self.group, self._knots, self.times.detach()
+        knots = tuple(x.detach() for x in knots)  # type: ignore[assignment]
+        if self.frame == "world":
+            knots = _from_world(*knots, group)  # type: ignore[assignment]
+        t = t.detach().reshape(-1) if t.ndim == 0 or len(values_batch(knots[0])) == 0 else t.detach()
+        place = locate_between(t, times, "error", True)
+        u, h = (x.to(knots[0].dtype) for x in (place.u, place.duration))
+        ends = _Ends(*(rows_at(x, place.segment) for x in _ends(*knots, times, group)))
+        of = _product_differentials if self.coordinates == "product" else _logarithm_differentials
+        jacobian = of(ends, u.expand(ends.X0.shape[:-1]), group)
+        jacobian = jacobian * _units(h.expand(ends.X0.shape[:-1]))[..., None, None]
+        natural = "right" if self.frame == "body" else "left"
+        if side != natural:
+            value = _fields(_table(ends, group, self.coordinates), u, group, self.coordinates, 0)[0]
+            jacobian = _other_side(jacobian, ends, value, group)
+        return Differentials(place.segment.expand(ends.X0.shape[:-1]), jacobian)
+
+
+def _units(h: Tensor) -> Tensor:
+    """From rates by u to rates per second, of results (3) and knots (6): `(..., 3, 6)`."""
+    one = torch.ones_like(h)
+    out, into = torch.stack([one, 1 / h, 1 / h**2], -1), torch.stack([one, one, h, h, h**2, h**2], -1)
+    return out[..., :, None] * into[..., None, :]
+
+
+def _other_side(jacobian: Tensor, ends: _Ends, value: Tensor, group: Group) -> Tensor:
+    """From perturbations `X Exp(delta)` to `Exp(delta) X`, of the motion or of its inverse."""
+    blocks = jacobian.clone()
+    for i, X in enumerate((ends.X0, ends.X1)):
+        back = group.adjoint(group.inverse(X, validate=False), validate=False)
+        blocks[..., i, :, :] = jacobian[..., i, :, :] @ back[..., None, :, :]
+    blocks[..., 0, :, :, :] = group.adjoint(value, validate=False)[..., None, :, :] @ blocks[..., 0, :, :, :]
+    return blocks
+
+
+def _product_differentials(ends: _Ends, u: Tensor, group: Group) -> Tensor:
+    """One reverse sweep for the unit cotangents of each output, `(..., 3, 6, D, D)`, by u, on the right."""
+    algebra, size = group.arithmetic, group.tangent_size
+    table = _table(ends, group, "product").unsqueeze(-2)  # a dimension for the rows
+    start, steps = split(table[..., : group.point_size]), table[..., group.point_size :]
+    d = [split(x) for x in steps.split(size, dim=-1)]
+    weights = [row.unsqueeze(-2).unbind(-1) for row in quintic_weights(u, 2).unbind(-2)]
+    _, trace = forward(algebra, start, d, weights, 2)
+    like = steps.new_empty(*steps.shape[:-2], size, size)
+    rows = split(torch.eye(size, dtype=u.dtype, device=u.device).expand_as(like))
+    none: Vector = zero(size)
+    outputs = []
+    for r in range(3):
+        cotangents = [rows if r == i else none for i in range(3)]
+        start_g, steps_g, _ = reverse(algebra, d, weights, trace, cotangents[0], cotangents[1:])
+        to_first, to_second = difference_reverse(algebra, d[0], steps_g[0])
+        blocks = [add(start_g, to_first), to_second, *steps_g[1:]]
+        outputs.append(torch.stack([join(b, like) for b in blocks], dim=-3))
+    return torch.stack(outputs, dim=-4)
+
+
+def _logarithm_differentials(ends: _Ends, u: Tensor, group: Group) -> Tensor:
+    """By forward mode, all queries at once."""
+    size = group.tangent_size
+    origin = torch.zeros(6, size, dtype=u.dtype, device=u.device)
+
+    def fields(delta: Tensor) -> tuple[Tensor, ...]:
+        moved = [
+            group.retract(X, d, side="right", validate=False)
+            for X, d in zip(ends[:2], delta[:2], strict=True)
+        ]
+        rates = [x + d for x, d in zip(ends[2:], delta[2:], strict=True)]
+        return _fields(_table(_Ends(*moved, *rates), group, "logarithm"), u, group, "logarithm", 2)
+
+    value = fields(origin)[0]
+
+    def outputs(delta: Tensor) -> Tensor:
+        moved, *rates = fields(delta)
+        step = group.log(group.between(value, moved, validate=False), validate=False)
+        return torch.stack([step, *rates], dim=-2)
+
+    return torch.func.jacfwd(outputs)(origin).movedim(-2, -3)
+
+
+__all__ = ["Differentials", "HermiteSpline", "hermite"]

@@ -1,0 +1,190 @@
+"""Curves made of segments between knots at given times, uniform or not: where a time falls, what extrapolation
+means."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
+from torchspline.groups.group import Group
+from torchspline.splines.clock import EXTRAPOLATE, Extrapolate
+from torchspline.splines.trajectory import State
+
+#: (segment, u) to value and rates by u, each (*batch, n, C); both arguments (n,) or (*batch, n), u within [0, 1].
+Curve = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+
+
+class Place(NamedTuple):
+    """Where times fall, each of the shape of the times; float64."""
+
+    segment: Tensor
+    u: Tensor
+    #: Duration of the segment, s.
+    duration: Tensor
+    #: How far before the start (negative) or past the end a time lies, s; None if none may.
+    beyond: Tensor | None
+
+
+def check_knot_times(times: Any, count: int | None, name: str = "times", what: str = "knots") -> Tensor:
+    """Times of knots: `(M,)` seconds, finite and increasing.
+
+    Args:
+        count: how many there have to be; None: two or more.
+    """
+    checks.is_floating_tensor(name, times)
+    if times.ndim != 1 or (count is not None and times.shape[0] != count):
+        size = "M" if count is None else count
+        raise ValueError(
+            f"{name}: expected shape ({size},), one time for each of the {what}, got {tuple(times.shape)}"
+        )
+    if times.shape[0] < 2:
+        raise ValueError(f"{name}: expected the times of at least two {what}, got {times.shape[0]}")
+    checks.finite(name, times)
+    later = times.detach().diff() > 0
+    if checks.values_visible(times) and checks.seen_true(later.all()) is False:
+        i = int(later.int().argmin())
+        raise ValueError(
+            f"{name}: expected increasing times, got {times[i].item()} and then {times[i + 1].item()}; sort them and "
+            "drop duplicates first"
+        )
+    return times
+
+
+def check_query(
+    t: Any, derivatives: int, extrapolate: str, validate: bool, like: Tensor, **batch: torch.Size
+) -> None:
+    """The arguments of an evaluation that do not concern the curve itself."""
+    if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
+        raise ValueError(
+            f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
+        )
+    checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
+    checks.is_floating_tensor("t", t)
+    if t.device != like.device:
+        (name,) = batch
+        raise ValueError(
+            f"t: on device {t.device}, but {name} are on {like.device}; move one with .to(device)"
+        )
+    if t.ndim > 1:
+        checks.broadcast(**batch, t=t.shape[:-1])
+    if validate:
+        checks.finite("t", t)
+
+
+def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate: bool) -> Place:
+    """Segment between neighbouring `times` (M,), which do not decrease, and place within it, computed before any
+    rounding to float32.
+
+    A knot belongs to the segment that it starts; the last one to the last segment. Where values cannot be seen (other
+    devices, `vmap`, compilation) times outside give NaN instead of an error.
+    """
+    knots, s = times.to(torch.float64).contiguous(), t.to(torch.float64)
+    steps = knots.diff()
+    if validate:
+        _check_rounding(t, steps)
+    # The last segment of some duration: knots may come more than once.
+    last = (knots.detach() < knots.detach()[-1]).sum() - 1
+    segment = torch.searchsorted(knots.detach(), s.detach().contiguous(), right=True) - 1
+    segment = torch.minimum(segment.clamp_min(0), last)
+    duration = steps[segment]
+    u = (s - knots[segment]) / duration
+    rounding = 8.0 * torch.finfo(torch.float32 if t.dtype == torch.float32 else torch.float64).eps
+    slack = rounding * knots.detach().abs().amax() / duration.detach() + rounding
+    outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
+    if extrapolate != "error":
+        inside = torch.where(outside, u.clamp(0.0, 1.0), u)
+        return Place(segment, inside, duration, (u - inside) * duration)
+    if validate and not _refuse(outside, t, knots):
+        u = torch.where(outside, torch.nan, u)
+    return Place(segment, u, duration, None)
+
+
+def _check_rounding(t: Tensor, steps: Tensor) -> None:
+    if t.dtype != torch.float32 or t.numel() == 0 or not checks.values_visible(t):
+        return
+    rounding = torch.finfo(torch.float32).eps * t.detach().abs().amax()
+    shortest = torch.where(steps.detach() > 0, steps.detach(), torch.inf).amin()
+    if checks.seen_true(rounding.to(torch.float64) > 1e-3 * shortest):
+        raise ValueError(
+            f"t: float32 rounds times near {t.detach().abs().amax().item():.6g} s to {rounding.item():.1e} s, more "
+            f"than a thousandth of the shortest segment, {shortest.item():g} s; pass float64 times or times relative "
+            "to a nearer origin"
+        )
+
+
+def _refuse(outside: Tensor, t: Tensor, knots: Tensor) -> bool:
+    """An error if a time is outside; else whether values could be seen at all."""
+    seen = checks.seen_true(outside.any()) if checks.values_visible(t, outside) else None
+    if not seen:
+        return seen is not None
+    first = t.detach()[outside].flatten()[0].item()
+    start, stop = knots.detach()[0].item(), knots.detach()[-1].item()
+    raise ValueError(
+        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] s, the first is "
+        f"{first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
+    )
+
+
+def rows_at(table: Tensor, segment: Tensor) -> Tensor:
+    """Rows of `table` (*batch, L, C) at `segment` (n,) or (*batch, n): `(*batch, n, C)`."""
+    if segment.ndim == 1:
+        return table.index_select(-2, segment)
+    return table.gather(-2, segment.unsqueeze(-1).expand(*segment.shape, table.shape[-1]))
+
+
+def align(t: Tensor, batch: torch.Size) -> tuple[Tensor, torch.Size, tuple[int, ...]]:
+    """Times (n,) or (*common, n), the batch that tables have to be expanded to, and the shape of the results."""
+    if t.ndim == 0:
+        return t.reshape(1), batch, tuple(batch)
+    if t.ndim == 1:
+        return t, batch, (*batch, t.shape[0])
+    if len(batch) == 0:  # one trajectory: a batch of times is just more times
+        return t.reshape(-1), batch, tuple(t.shape)
+    common = torch.broadcast_shapes(batch, t.shape[:-1])
+    return t.expand(*common, t.shape[-1]), common, (*common, t.shape[-1])
+
+
+def evaluate_segments(
+    curve: Callable[[torch.Size], Curve],
+    group: Group,
+    t: Tensor,
+    times: Tensor,
+    batch: torch.Size,
+    dtype: torch.dtype,
+    derivatives: int,
+    extrapolate: Extrapolate,
+    validate: bool,
+) -> State:
+    """Value and rates per second of a curve made of segments.
+
+    Args:
+        curve: makes the curve for a batch shape that its tables are to be expanded to. It returns as many rates as it
+            is built for, at least one if `extrapolate` is "linear" and else at least `derivatives`.
+        times: (M,), of the M - 1 segments. batch: of the curve's own tables.
+    """
+    aligned, common, shape = align(t, batch)
+    place = locate_between(aligned, times, extrapolate, validate)
+    fields = curve(common)(place.segment, place.u.to(dtype))
+    duration = place.duration.to(dtype).unsqueeze(-1)
+    fields = tuple(field if r == 0 else field / duration**r for r, field in enumerate(fields))
+    if place.beyond is not None:
+        fields = past_the_end(group, fields, place.beyond.to(dtype), extrapolate)
+    return State(*(f.reshape(*shape, f.shape[-1]) for f in fields[: derivatives + 1]))
+
+
+def past_the_end(
+    group: Group, fields: tuple[Tensor, ...], beyond: Tensor, extrapolate: Extrapolate
+) -> tuple[Tensor, ...]:
+    """Past an end: hold the pose, or keep the velocity there. `beyond` in the unit of time of the rates."""
+    value, *rates = fields
+    excess = beyond.unsqueeze(-1)
+    outside = excess != 0
+    held = []
+    if extrapolate == "linear":
+        drift = group.exp(excess * rates[0], validate=False)
+        value = group.compose(value, drift, validate=False)
+        held = [rates[0]]
+    return value, *held, *(torch.where(outside, 0.0, rate) for rate in rates[len(held) :])
