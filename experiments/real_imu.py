@@ -56,6 +56,17 @@ def compare(recording: Recording, spacing: float | str, alignment: Alignment | N
     return Compared(gyro, accel, alignment, fit.trajectory.dt_ns / SECOND, seconds, notes)
 
 
+def best_alignment(recording: Recording, spacings: list[int]) -> Alignment | None:
+    """That with the trajectory whose knots suit the recording best: noise and missed motion spoil the others."""
+    found = []
+    for spacing in spacings:
+        try:
+            found.append(compare(recording, spacing).alignment)
+        except ValueError:  # so wide that the trajectory has little in common with the readings
+            continue
+    return min(found, key=lambda a: a.gyro_rms * (a.accel_rms or 0.0), default=None)
+
+
 def errors(
     trajectory: BSpline, recording: Recording, alignment: Alignment, start: int, stop: int
 ) -> tuple[float, float]:
@@ -225,7 +236,8 @@ def experiment(out: Path, data: str, recordings: list[str], spacings: list[int],
     for name in recordings:
         recording = load(ROOT / data, name, seed)
         x: dict[Any, Any] = {"auto": compare(recording, "auto")}
-        x.update((spacing, compare(recording, spacing, x["auto"].alignment)) for spacing in spacings)
+        alignment = best_alignment(recording, spacings) or x["auto"].alignment
+        x.update((spacing, compare(recording, spacing, alignment)) for spacing in spacings)
         x["halves"] = halves(recording, x["auto"].spacing)
         found[name] = x
         a = x["auto"]
