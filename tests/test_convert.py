@@ -200,7 +200,27 @@ def test_euler_gradient_in_gimbal_lock(sequence):
 
 # ---------------------------------------------------------------------- gradients and transforms
 
+
+def dual_quaternions(*batch, **kind):
+    return convert.pose_to_dual_quaternion(poses(*batch, **kind))
+
+
+def numbers_of_screw(Q):
+    angle, pitch, axis, moment = convert.to_screw(Q)
+    return torch.cat([angle[..., None], pitch[..., None], axis, moment], dim=-1)
+
+
+def screw(x):
+    """Eight numbers as a screw, and from that a dual quaternion."""
+    axis = torch.nn.functional.normalize(x[..., 2:5], dim=-1)
+    return convert.from_screw(x[..., 0], x[..., 1], axis, x[..., 5:])
+
+
 DIFFERENTIABLE = {
+    "pose_to_dual_quaternion": (convert.pose_to_dual_quaternion, poses),
+    "pose_from_dual_quaternion": (convert.pose_from_dual_quaternion, dual_quaternions),
+    "to_screw": (numbers_of_screw, dual_quaternions),
+    "from_screw": (screw, dual_quaternions),
     "to_xyzw": (convert.to_xyzw, rotations),
     "from_xyzw": (convert.from_xyzw, rotations),
     "pose_to_xyzw": (convert.pose_to_xyzw, poses),

@@ -91,9 +91,11 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     segment = torch.minimum(segment.clamp_min(0), last)
     duration = steps[segment]
     u = (s - knots[segment]) / duration
+    # A few rounding errors beyond the ends belong to the domain.
     rounding = 8.0 * torch.finfo(torch.float32 if t.dtype == torch.float32 else torch.float64).eps
-    slack = rounding * knots.detach().abs().amax() / duration.detach() + rounding
-    outside = (u.detach() < -slack) | (u.detach() > 1.0 + slack) | u.detach().isnan()
+    ends = knots.detach()
+    slack = rounding * (ends.abs().amax() + ends[-1] - ends[0])
+    outside = ~((s.detach() >= ends[0] - slack) & (s.detach() <= ends[-1] + slack))
     if extrapolate != "error":
         inside = torch.where(outside, u.clamp(0.0, 1.0), u)
         return Place(segment, inside, duration, (u - inside) * duration)
