@@ -57,22 +57,26 @@ ACCEPTED.update(
         "BatchProblem.add": (BATCH.add, {"residual": EACH, "trajectory": WHICH}),
         "BatchProblem.add_prior": (BATCH.add_prior, {"variable": ROWS, "sigma": 1.0}),
         "BatchProblem.solve": (BATCH.solve, SOLVING),
+        "BatchResult.covariance": (lambda variable: BATCH.solve().covariance(variable), {"variable": ROWS}),
     }
 )
 
 _UPDATES = "SlidingWindow.update BatchProblem.solve"
 _PRIORS = "SlidingWindow.add_prior BatchProblem.add_prior"
 _ADD = "SlidingWindow.add BatchProblem.add"
-_OTHERS = f"{_PRIORS} SlidingWindow.random_walk"
+_OTHERS = f"{_PRIORS} SlidingWindow.random_walk BatchResult.covariance"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
-    "shape": {"plain numbers": f"{_UPDATES} SlidingWindow.extend"},
-    "dtype": {"plain numbers ": f"{_UPDATES} SlidingWindow.extend", "a spline was checked": "BatchProblem"},
+    "shape": {"plain numbers": f"{_UPDATES} SlidingWindow.extend BatchResult.covariance"},
+    "dtype": {
+        "plain numbers ": f"{_UPDATES} SlidingWindow.extend BatchResult.covariance",
+        "a spline was checked": "BatchProblem",
+    },
     "device": {
         "plain numbers  ": f"{_UPDATES} SlidingWindow.extend",
         "solved on the CPU, where all comes together": f"{_ADD} {_OTHERS}",
     },
-    "nan": {"residuals and splines were checked when they were made": f"{_ADD} BatchProblem"},
+    "nan": {"what was checked when it was made": f"{_ADD} BatchProblem BatchResult.covariance"},
     "zero quaternion": {
         "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} {_UPDATES} SlidingWindow.extend BatchProblem"
     },
@@ -83,6 +87,7 @@ NOT_APPLICABLE = {
 
 def cases() -> Iterator[Case]:
     yield from windows()
+    yield from results()
     yield from residuals()
     for function in ("SlidingWindow.add_prior", "SlidingWindow.random_walk", "BatchProblem.add_prior"):
         yield from sigmas(function)
@@ -96,6 +101,16 @@ def cases() -> Iterator[Case]:
         for name in ("cost_tolerance", "gradient_tolerance"):
             yield from numbers(function, name, -1.0)
         yield from numbers(function, "damping", 0.0, -1.0)
+
+
+def results() -> Iterator[Case]:
+    for bad in (None, "bias", SPLINE):
+        yield refused(
+            "BatchResult.covariance", "variable", "type", bad, f"got {type(bad).__name__}", "fit.Variable"
+        )
+    yield refused(
+        "BatchResult.covariance", "variable", "option", BIAS, "bias is not among", "unknowns that were solved"
+    )
 
 
 def windows() -> Iterator[Case]:
@@ -152,9 +167,7 @@ def residuals() -> Iterator[Case]:
     function = "SlidingWindow.add"
     several = Gyroscope(T, V[0, :3], bias=ROWS)
     index = {"bias": WHICH[:2]}
-    yield refused(
-        function, "index", "shape", index, "", "int64 index of shape (3,)", "bias", residual=several
-    )
+    yield refused(function, "index", "shape", index, "", "index of shape (3,)", "bias", residual=several)
     spline = BSpline(V[0], group=R3, dt=1.0)
     wandering = Gyroscope(T, V[0, :3], bias=spline)
     for function in _ADD.split():

@@ -74,7 +74,16 @@ def public() -> dict[str, Callable[..., Any]]:
 
 
 #: What the library makes and hands out; nobody is meant to call these.
-RESULTS = {"State", "Kinematics", "ImuReading", "PoseFit", "Result", "Alignment", "Differentials"}
+RESULTS = {
+    "State",
+    "Kinematics",
+    "ImuReading",
+    "PoseFit",
+    "Result",
+    "BatchResult",
+    "Alignment",
+    "Differentials",
+}
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
