@@ -22,6 +22,17 @@ from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, product
 
 F64 = torch.float64
+
+
+@pytest.fixture(autouse=True, params=["auto", "reference"])
+def kernels(request):
+    """Compiled loops; the reference only where it takes less than a few seconds."""
+    if request.param == "reference" and ("rigid" in request.node.name or "scatter" in request.node.name):
+        pytest.skip("takes long, and says nothing that shorter ones do not")
+    with ts.use_kernels(request.param):
+        yield
+
+
 EXACT = {"max_iterations": 6, "cost_tolerance": 0.0, "gradient_tolerance": 1e-12, "damping": 1e-13}
 LINEAR = Options(*EXACT.values())
 

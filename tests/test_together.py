@@ -64,8 +64,13 @@ def perturbed(trajectories):
     "clock", [{"dt": 0.1, "t0": -2.0}, {"dt_ns": 100_000_000, "t0_ns": 10**18}], ids=["s", "ns"]
 )
 @pytest.mark.parametrize("group", [SE3, product(R3, SO3)], ids=str)
-def test_each_comes_out_as_if_it_were_alone(group, clock):
-    B = 5
+@pytest.mark.parametrize("mode", ["reference", "auto"])
+def test_each_comes_out_as_if_it_were_alone(group, clock, mode):
+    with ts.use_kernels(mode):
+        compare_with_each_alone(group, clock)
+
+
+def compare_with_each_alone(group, clock, B=5):
     truth = windows(group, B, **clock)
     t, which, gyro, force, at, of, poses = inertial(truth)
     mixed = torch.randperm(len(t), generator=torch.Generator().manual_seed(0))  # in any order

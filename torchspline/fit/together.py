@@ -133,7 +133,8 @@ class BatchProblem:
         options = Options.checked(max_iterations, cost_tolerance, gradient_tolerance, damping)
         if not self._residuals:
             raise ValueError("solve: the problem has no residuals; add some with problem.add(...)")
-        with torch.no_grad():
+        # Numbers of a trajectory may overflow; it then takes no further part.
+        with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
             linearizer = _Linearizer(self)
             state, result = _minimise(linearizer, options)
             linearizer.store(state)
