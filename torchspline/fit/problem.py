@@ -240,6 +240,8 @@ class Linearizer:
     def __init__(self, model: Model, terms: Sequence[Term | Bends | BoundPrior]):
         self.model, self.terms = model, list(terms)
         self.fused = model.trajectory.local.fused
+        #: Of each term that touches the same unknowns wherever these stand: how far apart, and how many at a time.
+        self._reaches: dict[int, tuple[int, int]] = {}
 
     def __call__(self, state: State) -> System:
         system = self._empty(state)
@@ -252,16 +254,24 @@ class Linearizer:
         model = self.model
         width = narrow = 1
         for term in self.terms:
-            columns = term.touched(state)
-            if columns.size == 0:
-                continue
-            spline = np.where(columns < model.band, columns, -1)
-            low = np.where(spline < 0, model.total, spline).min(axis=1)
-            width = max(width, int((spline.max(axis=1) - low).max()) + 1)
-            narrow = max(narrow, columns.shape[1])
+            reach = self._reaches.get(id(term))
+            if reach is None:
+                reach = self._reach(term.touched(state))
+                if not (isinstance(term, Term) and term.clock):
+                    self._reaches[id(term)] = reach
+            width, narrow = max(width, reach[0]), max(narrow, reach[1])
         if width > _WIDEST_BAND * narrow or model.total - model.band > _WIDEST_BORDER:
             return SparseSystem(model, self.fused)
         return BandSystem(model, self.fused, width)
+
+    def _reach(self, columns: Array) -> tuple[int, int]:
+        """How wide a band these columns (runs, C) of unknowns need, and C."""
+        if columns.size == 0:
+            return 1, 1
+        model = self.model
+        spline = np.where(columns < model.band, columns, -1)
+        low = np.where(spline < 0, model.total, spline).min(axis=1)
+        return int((spline.max(axis=1) - low).max()) + 1, columns.shape[1]
 
 
 def _check_spline(name: str, spline: BSpline) -> None:

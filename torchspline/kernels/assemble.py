@@ -93,29 +93,42 @@ def workspace(width, like):
 
 
 def to_points(local, bases, chain, order, size, moved):
-    """`moved` = T^T `local`, T from control points to local coordinates: logarithm j moves with its two points."""
+    """`moved` = T^T `local`, T from control points to local coordinates: logarithm j moves with its two points.
+
+    Six rows are added at a time: the loop over columns is short, and starting it costs more than a few products.
+    """
     width = local.shape[1]
     for a in range(local.shape[0]):
         for b in range(width):
             moved[a, b] = local[a, b]
     for s in range(len(bases)):
         offset = s * order * size
-        for j in range(1, order):
+        for j in range(order):
+            here, after = offset + j * size, offset + min(j + 1, order - 1) * size
+            ending = chain[bases[s] + max(j - 1, 0), 1]  # of the logarithm that ends at point j
+            starting = chain[bases[s] + min(j, order - 2), 0]  # of the one that starts there
             for c in range(size):
-                line = moved[offset + j * size + c]
+                line = moved[here + c]
                 for b in range(width):
                     line[b] = 0.0
-        for j in range(1, order):
-            pair = chain[bases[s] + j - 1]
-            for half in range(2):
-                for c in range(size):
-                    line = moved[offset + (j - 1 + half) * size + c]
-                    for e in range(size):
-                        factor = pair[half, e, c]
-                        if factor != 0.0:
-                            source = local[offset + j * size + e]
-                            for b in range(width):
-                                line[b] += factor * source[b]
+                for e in range(0, size, 3):
+                    e1, e2 = min(e + 1, size - 1), min(e + 2, size - 1)
+                    f0, f1, f2 = ending[e, c], ending[e1, c], ending[e2, c]
+                    g0, g1, g2 = starting[e, c], starting[e1, c], starting[e2, c]
+                    if j == 0:  # the point itself comes first among local coordinates
+                        f0, f1, f2 = 1.0 * (e == c), 1.0 * (e1 == c), 1.0 * (e2 == c)
+                    if j == order - 1:
+                        g0, g1, g2 = 0.0, 0.0, 0.0
+                    if e + 1 >= size:
+                        f1, g1 = 0.0, 0.0
+                    if e + 2 >= size:
+                        f2, g2 = 0.0, 0.0
+                    x0, x1, x2 = local[here + e], local[here + e1], local[here + e2]
+                    y0, y1, y2 = local[after + e], local[after + e1], local[after + e2]
+                    for b in range(width):
+                        line[b] += (f0 * x0[b] + f1 * x1[b] + f2 * x2[b]) + (
+                            g0 * y0[b] + g1 * y1[b] + g2 * y2[b]
+                        )
 
 
 def to_band(rows, starts, bases, chain, order, size, columns, band, border, corner, right):
