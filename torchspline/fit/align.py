@@ -102,7 +102,8 @@ def align_imu(
     The lag comes from the correlation of angular speeds, which no rotation changes; the rotation and gyroscope bias at
     the most likely lags from Wahba's problem, the best of which goes on; gravity, accelerometer bias and lever arm from
     linear least squares. Then all of them together, the trajectory held, by `Problem.solve`, readings weighted by what
-    their residuals turn out to be.
+    their residuals turn out to be. The lever arm comes from angular accelerations: it is the first to suffer where the
+    trajectory follows noise or misses motion, or smooths positions more than rotations.
 
     Args:
         trajectory: of a rigid body (SE3 or R3xSO3; SO3 without `accel`), without a batch, on the CPU.

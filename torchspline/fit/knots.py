@@ -20,6 +20,12 @@ _RATIO = 2**0.5
 _LEAST_POSES, _LEAST_INTERVALS = 1.5, 6
 #: How often worse than the best so far ends the search.
 _GIVE_UP = 5.0
+#: A minimum is one if what follows rises by this factor; falling by no more than this factor twice in a row is level.
+_RISE, _LEVEL = 1.5, 0.8
+#: Spacings from level ground to the minimum at least, if it is to count for more.
+_WELL_BEFORE = 3
+#: Changes within this factor of the least count as alike.
+_ALIKE = 1.7
 #: The fits agree best about here, but the acceleration of the narrower one is nearer to the truth: in what it misses
 #: the wider one is off by a multiple. Found on recordings with an IMU beside the poses.
 _NARROWER = 0.7
@@ -178,12 +184,12 @@ def choose_spacing(
         return Spacing(
             tried[0], tried[0], f"too few poses to compare spacings: {tried[0] * 1e3:.3g} ms, the narrowest"
         )
-    rotation, position = (_least(tried, [c[i] for c in changes]) for i in (0, 1))
+    (rotation, turns), (position, pulls) = (_least(tried, [c[i] for c in changes]) for i in (0, 1))
     position *= _NARROWER
     reason = (
         f"fits at neighbouring spacings agree best at {rotation * 1e3:.3g} ms in angular velocity (to "
-        f"{min(c[0] for c in changes):.3g} rad/s) and at {position * 1e3:.3g} ms in acceleration (to "
-        f"{min(c[1] for c in changes):.3g} m/s^2)"
+        f"{turns:.3g} rad/s) and at {position * 1e3:.3g} ms in acceleration (to "
+        f"{pulls:.3g} m/s^2)"
     )
     return Spacing(rotation, position, reason)
 
@@ -211,16 +217,42 @@ def _well_inside(times: Tensor, unit: float, narrow: float) -> Tensor:
     return inside if bool(inside.any()) else torch.ones_like(inside)
 
 
-def _least(tried: list[float], changes: list[float]) -> float:
-    """The spacing of least change, between the two that were compared; a parabola through three finds it."""
+def _least(tried: list[float], changes: list[float]) -> tuple[float, float]:
+    """The spacing of least change, between the two that were compared, and that change; a parabola through three finds
+    it."""
     middles = np.log([math.sqrt(a * b) for a, b in pairwise(tried)])
+    best = _turn(changes)
+    if best <= 1:
+        # Noise that is smooth from pose to pose, as that of interpolated or filtered poses is, hardly changes between
+        # narrow spacings: fits agree there without being right. The widest that agrees as well has less of it.
+        alike = [c <= _ALIKE * min(changes[:2]) for c in changes]
+        best = alike.index(False, best) - 1 if False in alike[best:] else best
+        if best > 1:
+            return float(np.exp(middles[best])), changes[best]
     heights = np.log(np.maximum(changes, 1e-300))
-    best = int(np.argmin(heights))
     if 0 < best < len(heights) - 1:
         a, b, c = heights[best - 1 : best + 2]
         shift = 0.5 * (a - c) / max(a - 2 * b + c, 1e-12)
-        return float(np.exp(middles[best] + np.clip(shift, -0.5, 0.5) * np.log(_RATIO)))
-    return float(np.exp(middles[best]))
+        return float(np.exp(middles[best] + np.clip(shift, -0.5, 0.5) * np.log(_RATIO))), changes[best]
+    return float(np.exp(middles[best])), changes[best]
+
+
+def _turn(changes: list[float]) -> int:
+    """Where changes stop falling with the noise: the first minimum that is one, or well before it where they level out.
+
+    The least of all may be at spacings so wide that neighbouring fits agree on missing the motion.
+    """
+    best = 0
+    for i, change in enumerate(changes):
+        if change < changes[best]:
+            best = i
+        elif change > _RISE * changes[best]:
+            break
+    ratios = [b / max(a, 1e-300) for a, b in pairwise(changes)]
+    for i in range(1, best - _WELL_BEFORE + 1):
+        if min(ratios[i], ratios[i + 1]) > _LEVEL:
+            return i
+    return best
 
 
 def _widest_within(

@@ -1,0 +1,28 @@
+"""Which spacing changes between neighbouring fits speak for."""
+
+import pytest
+
+from torchspline.fit.knots import _least
+
+RATIO = 2**0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "best"),
+    [
+        # Noise falls, missed motion rises: the parabola through three lies between their spacings.
+        ([8.0, 4.0, 2.0, 1.0, 2.0, 4.0, 8.0], 3),
+        # Wide fits agree on missing the motion.
+        ([8.0, 4.0, 2.0, 1.0, 2.0, 4.0, 2.0, 0.5, 0.1], 3),
+        # Motion of all frequencies: changes level out, and fall again where nothing is left to miss.
+        ([8.0, 4.0, 2.0, 1.8, 1.6, 1.4, 1.0, 0.7, 0.5, 0.3, 0.1], 2),
+        # Smooth noise does not show between narrow spacings.
+        ([1.0, 1.1, 1.4, 1.5, 3.0, 6.0], 3),
+    ],
+)
+def test_the_first_minimum_counts(changes, best):
+    tried = [RATIO**i for i in range(len(changes) + 1)]
+    spacing, change = _least(tried, changes)
+    assert change == changes[best]
+    # The parabola moves it by half a step at most.
+    assert RATIO**best * 0.999 < spacing < RATIO ** (best + 1) * 1.001
