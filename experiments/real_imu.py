@@ -205,6 +205,9 @@ def figure(found: dict[str, dict[str, Any]], spacings: list[int]) -> Figure:
             )  # fmt: skip
         axis.axvline(1.0, color="0.4", linewidth=1)
         axis.set_xscale("log")
+        ticks = [x for x in (1, 2, 5, 10, 20, 50) if axis.get_xlim()[0] <= x <= axis.get_xlim()[1]]
+        axis.set_xticks(ticks, list(map(str, ticks)))
+        axis.set_xticks([], minor=True)
         axis.set_title({"gyro": "gyroscope", "accel": "accelerometer"}[sensor])
         axis.set_xlabel("RMSE / yardstick's best")
         axis.grid(alpha=0.3, which="both")
