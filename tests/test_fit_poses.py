@@ -1,6 +1,7 @@
 """Trajectories fitted to timed poses: known splines, dense least squares, awkward input."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -125,7 +126,7 @@ def test_the_gradient_of_the_documented_cost_vanishes(representation):
     (typical,) = torch.autograd.grad(off, fit.trajectory.control_points)
     assert off > cost
     assert gradient.norm() < 1e-5 * typical.norm()
-    assert fit.cost == sorted(fit.cost, reverse=True)
+    assert all(b <= a * (1 + 1e-14) for a, b in pairwise(fit.cost))
 
 
 def test_sigmas_weigh_positions_against_rotations_in_joint_fits_only():
