@@ -13,7 +13,7 @@ from torchspline import checks
 from torchspline.fit import align_start
 from torchspline.fit.align_joint import FEWEST, Joint, Readings, Solution
 from torchspline.fit.losses import GemanMcClure, Loss
-from torchspline.fit.model import NANOSECOND
+from torchspline.fit.model import NANOSECOND, with_points
 from torchspline.fit.residual import needs
 from torchspline.groups.group import SO3
 from torchspline.imu.synthesis import STANDARD_GRAVITY
@@ -128,7 +128,8 @@ def align_imu(
             checks.positive(name, x)
     if loss is not None:
         checks.instance("loss", loss, Loss, "a robust loss such as torchspline.fit.Huber(1.0), or None")
-    body = _held(trajectory)
+    # A copy: solving writes the numbers back.
+    body = with_points(trajectory, trajectory.control_points.detach().to(torch.float64))
     stamps = _Stamps(t, body)
     sensors = [_clean("gyro", stamps.s, gyro)] + ([] if accel is None else [_clean("accel", stamps.s, accel)])
     start = _start(body, stamps, sensors[0], max_offset, alone=accel is None)
@@ -215,18 +216,6 @@ def _check(trajectory: BSpline, t: Tensor, gyro: Tensor, accel: Tensor | None) -
             )
         if y.dtype != torch.int64:
             checks.finite(name, y.masked_fill(y.isnan(), 0.0))
-
-
-def _held(trajectory: BSpline) -> BSpline:
-    """A copy in float64 that the solver may write to."""
-    points = trajectory.control_points.detach().to(torch.float64)
-    if trajectory.dt_ns is not None:
-        times: dict[str, Any] = {"dt_ns": trajectory.dt_ns, "t0_ns": trajectory.t0_ns}
-    else:
-        assert trajectory.dt is not None
-        assert trajectory.t0 is not None
-        times = {"dt": float(trajectory.dt.detach()), "t0": float(trajectory.t0.detach())}
-    return BSpline(points, group=trajectory.group, order=trajectory.order, learnable=False, **times)
 
 
 def _clean(name: str, s: Array, x: Tensor) -> Readings:

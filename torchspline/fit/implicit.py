@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchspline.fit.model import Model, State
+from torchspline.fit.model import Model, State, seconds_of
 from torchspline.fit.residual import square_root_information
 from torchspline.fit.system import Factor, SingularError, System
-from torchspline.fit.terms import Term, seconds_of
+from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.components import join, split
 from torchspline.splines.bspline import BSpline, bspline
@@ -36,7 +36,7 @@ def differentiable(linearizer: "Linearizer", state: State, system: System) -> Nu
     Raises:
         ValueError: nothing requires grad; the solution is not determined.
     """
-    tensors = inputs_of(linearizer)
+    tensors = _inputs(linearizer)
     if not tensors:
         raise ValueError(
             "differentiable: none of the measurements, times, standard deviations or known arguments requires grad"
@@ -55,7 +55,7 @@ def differentiable(linearizer: "Linearizer", state: State, system: System) -> Nu
     return dict(zip(keys, numbers, strict=True))
 
 
-def inputs_of(linearizer: "Linearizer") -> list[Tensor]:
+def _inputs(linearizer: "Linearizer") -> list[Tensor]:
     """The tensors that require grad among what residuals were made of, each once."""
     found: dict[int, Tensor] = {}
     for term in _terms(linearizer):

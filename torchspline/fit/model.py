@@ -71,6 +71,23 @@ def seconds(t: float | int, origin: float | int) -> float:
     return (t - origin) * NANOSECOND if isinstance(origin, int) else float(t - origin)
 
 
+def seconds_of(t: torch.Tensor, origin: float | int) -> torch.Tensor:
+    """The same of a tensor of times, float64."""
+    if t.dtype == torch.int64:
+        return (t - int(origin)).to(torch.float64) * NANOSECOND
+    return t.to(torch.float64) - origin
+
+
+def with_points(spline: BSpline, points: torch.Tensor) -> BSpline:
+    """Another spline of the same group, order and clock, whose control points are `points` `(..., M, P)`, no
+    Parameter."""
+    options: dict[str, Any] = {"dt_ns": spline.dt_ns, "t0_ns": spline.t0_ns}
+    if spline.dt is not None:
+        assert spline.t0 is not None
+        options = {"dt": float(spline.dt.detach()), "t0": float(spline.t0.detach())}
+    return BSpline(points, group=spline.group, order=spline.order, learnable=False, **options)
+
+
 @dataclass
 class State:
     """Numbers of all unknowns."""
@@ -136,7 +153,7 @@ class Model:
             for s in self.splines
         }
         values = {id(v): v.points(v.value) for v in self.variables}
-        return self._prepared(points, values)
+        return self.prepared(points, values)
 
     def moved(self, state: State, step: Array) -> State:
         """All unknowns moved by a step `(total,)` in their tangent spaces."""
@@ -151,9 +168,10 @@ class Model:
             if key in self.columns:
                 value = variable.retract(value, torch.from_numpy(padded[self.columns[key]]))
             values[key] = value
-        return self._prepared(points, values)
+        return self.prepared(points, values)
 
-    def _prepared(self, points: dict[int, Array], values: dict[int, torch.Tensor]) -> State:
+    def prepared(self, points: dict[int, Array], values: dict[int, torch.Tensor]) -> State:
+        """With what follows from the trajectory's points."""
         local = self.trajectory.local.at(points[id(self.trajectory.module)])
         return State(points, values, local, self.trajectory.local.pair_jacobians(local))
 

@@ -17,7 +17,7 @@ from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Residual
 from torchspline.fit.result import Result
 from torchspline.fit.solver import Options, minimise
-from torchspline.fit.streams import Stream, clock_unknowns, trajectory_times, variables_of
+from torchspline.fit.streams import Stream, trajectory_times, variables_of
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
@@ -171,7 +171,7 @@ class SlidingWindow:
             tau = trajectory_times(residual, origin)
             self._check_late(residual, tau)
             last = residual.t.max().item()
-            if clock_unknowns(residual):
+            if residual.clock.unknowns:
                 last = self._unit(origin, float(tau.max()))
             more = self._beyond("t", last)
         # A problem of its own tells what is wrong before anything changes.
@@ -191,7 +191,7 @@ class SlidingWindow:
     def _check_late(self, residual: Residual, tau: Array) -> None:
         start = self._knot(self._first)
         late = torch.from_numpy((tau < 0).any(axis=0))
-        if not clock_unknowns(residual):
+        if not residual.clock.unknowns:
             late = (residual.t < start).reshape(type(residual).moments, -1).any(dim=0)
         elif self._first == 0:  # nothing is lost yet, and the clock may still turn out otherwise
             return
@@ -219,7 +219,7 @@ class SlidingWindow:
         probe._know(list(self._variables.values()))
         probe.add_prior(variable, sigma=sigma, covariance=covariance, information=information)
         self._variables[variable.name] = variable
-        self._priors += probe._priors
+        self._priors += probe.priors
 
     def random_walk(self, variable: Variable, sigma: Tensor | float) -> None:
         """Let a variable change over time: what was remembered of it grows old.
@@ -314,7 +314,7 @@ class SlidingWindow:
                 problem.add(stream.residual, **stream.which)
             for prior in self._priors_on(spline):
                 problem._know([part.unknown for part in prior.parts])
-                problem._priors.append(prior)
+                problem.priors.append(prior)
             linearizer = problem.prepare()
             linearizer.terms.append(Bends(linearizer.model, self._stiffness))
             model = linearizer.model
@@ -331,7 +331,7 @@ class SlidingWindow:
         """Append control points for measurements that their clocks moved beyond the end."""
         origin = self._knot(self._first)
         for residual in self._residuals():
-            if clock_unknowns(residual) and len(residual):
+            if residual.clock.unknowns and len(residual):
                 last = float(trajectory_times(residual, origin).max())
                 self._append(self._beyond("clock", self._unit(origin, last)))
 
@@ -400,7 +400,7 @@ class SlidingWindow:
             residual = stream.residual
             base, *_ = model.place(trajectory_times(residual, origin))
             old = torch.from_numpy((base < excess).any(axis=0))
-            if not clock_unknowns(residual):  # as the window will see it, whatever the rounding of either
+            if not residual.clock.unknowns:  # as the window will see it, whatever the rounding of either
                 old |= (residual.t < start).reshape(base.shape).any(dim=0)
             if bool(old.any()):
                 gone.append((stream.select(old), int(base[:, old.numpy()].max()) + self.order))

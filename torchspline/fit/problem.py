@@ -42,7 +42,7 @@ class Problem:
         self._indices: list[dict[str, Array]] = []
         self._frozen: dict[int, Array | bool] = {}
         self._unknowns: list[Unknown] = [trajectory]
-        self._priors: list[Prior] = []
+        self.priors: list[Prior] = []
 
     # ------------------------------------------------------------------ building
 
@@ -139,7 +139,7 @@ class Problem:
         self._know([variable])
         reference = variable.points(variable.value).reshape(count, -1)
         H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
-        self._priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
+        self.priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
 
     def freeze(self, unknown: Unknown, points: Tensor | None = None) -> None:
         """Keep an unknown as it is: a `Variable`, or control points of a spline.
@@ -231,7 +231,7 @@ class Problem:
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, self._frozen)
         terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
-        return Linearizer(model, [*terms, *(prior.bind(model) for prior in self._priors)])
+        return Linearizer(model, [*terms, *(prior.bind(model) for prior in self.priors)])
 
 
 class Linearizer:

@@ -40,6 +40,12 @@ class Slot(NamedTuple):
     default: tuple[float, ...] | None
 
 
+#: How a sensor sits on the body: its pose or rotation (sensor to body) and its position, by default those of the body.
+POSE_IN_BODY = Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+ROTATION_IN_BODY = Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0))
+LEVER_ARM = Slot(3, None, (0.0, 0.0, 0.0))
+
+
 class Moment(NamedTuple):
     """The trajectory at one time: value, and as many rates as the residual asked for. Or cotangents of these, that of
     the value of a body tangent."""
@@ -120,7 +126,7 @@ class Residual(ABC):
     #: How many rates it needs, and at how many times it looks at the trajectory.
     derivatives: ClassVar[int]
     moments: ClassVar[int] = 1
-    #: Range of quaternion components of what is measured.
+    #: Ranges of the components of what is measured that are quaternions.
     measured_signs: ClassVar[tuple[tuple[int, int], ...]] = ()
     slots: ClassVar[Mapping[str, Slot]] = {}
 

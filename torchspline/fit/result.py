@@ -28,7 +28,7 @@ _DIRECTIONS = 12
 
 
 @dataclass(frozen=True)
-class Direction:
+class OpenDirection:
     """A combination of unknowns that the measurements do not determine."""
 
     #: Eigenvalue of the scaled normal equations: 0 is not at all.
@@ -107,7 +107,7 @@ class Result:
     @property
     def variance_factor(self) -> float:
         """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
-        rows = sum(len(term) * term.kernel_rows() for term in self._terms())
+        rows = sum(len(term) * term.kernel.rows for term in self._terms())
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
     # ------------------------------------------------------------------ how sure
@@ -175,7 +175,7 @@ class Result:
     # ------------------------------------------------------------------ what is left open
 
     @cached_property
-    def observability(self) -> list[Direction]:
+    def observability(self) -> list[OpenDirection]:
         """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
         diagonal = self._system.diagonal()
         dead = np.flatnonzero(diagonal <= 0)
@@ -212,7 +212,7 @@ class Result:
         vectors = basis @ rotation
         return [(max(float(v), 0.0), x) for v, x in zip(values[:count], vectors.T, strict=False)]
 
-    def _direction(self, value: float, step: Array) -> Direction:
+    def _direction(self, value: float, step: Array) -> OpenDirection:
         step = step / max(np.abs(step).max(), 1e-300)
         model, shares, steps = self._linearizer.model, {}, {}
         diagonal = np.sqrt(np.maximum(self._system.diagonal(), 0.0))
@@ -225,7 +225,7 @@ class Result:
             there = columns >= 0
             shares[name] = float(weight[columns[there]].sum() / weight.sum())
             steps[name] = torch.from_numpy(np.where(there, step[columns], 0.0))
-        return Direction(value, dict(sorted(shares.items(), key=lambda x: -x[1])), steps)
+        return OpenDirection(value, dict(sorted(shares.items(), key=lambda x: -x[1])), steps)
 
     def _named(self) -> list[tuple[str, Unknown]]:
         model = self._linearizer.model

@@ -16,8 +16,8 @@ from torchspline.kernels.mode import RefusedError
 
 Array = NDArray[Any]
 #: Damping is a share of the diagonal, which is taken to be at least this share of its largest element.
-_LEAST_DIAGONAL = 1e-12
-_MOST_DAMPING = 1e12
+LEAST_DIAGONAL = 1e-12
+MOST_DAMPING = 1e12
 #: Shares of the cost below which its differences are noise.
 _ROUNDING = 1e-11
 
@@ -94,7 +94,7 @@ def minimise(
             trace.reason, trace.converged = "no unknown could come nearer: the gradient is zero", True
             return state, system, trace
         scale = system.diagonal()
-        scale = np.maximum(scale, _LEAST_DIAGONAL * scale.max(initial=0.0))
+        scale = np.maximum(scale, LEAST_DIAGONAL * scale.max(initial=0.0))
         scale[scale == 0.0] = 1.0
         step = _step(system, damping * scale)
         clock = trace.spend("solve", clock)
@@ -126,7 +126,7 @@ def minimise(
                 return state, system, trace
         else:
             damping, growth = damping * growth, 2 * growth
-            if damping > _MOST_DAMPING:
+            if damping > MOST_DAMPING:
                 trace.reason = "no step lowers the cost, however small"
                 return state, system, trace
     trace.reason = f"reached {options.iterations} iterations"

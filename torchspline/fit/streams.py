@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchspline.fit.model import NANOSECOND
+from torchspline.fit.model import seconds_of
 from torchspline.fit.residual import Argument, Clock, Residual
 from torchspline.fit.variables import Variable
 
@@ -65,8 +65,8 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
     (moments, N), seconds from the origin.
     """
     clock = residual.clock
-    t = _seconds(residual.t.detach().cpu().reshape(type(residual).moments, -1), origin)
-    if not clock_unknowns(residual):
+    t = seconds_of(residual.t.detach().cpu().reshape(type(residual).moments, -1), origin).numpy()
+    if not clock.unknowns:
         return t
     offset, skew, delay = (
         0.0 if v is None else float(v.value[0]) for v in (clock.offset, clock.skew, clock.delay)
@@ -78,25 +78,14 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
                 f"clock: the skew of {residual.name} turns about the middle of the trajectory, which moves in "
                 "a window; expected Clock(mid=...)"
             )
-        mid = float(_seconds(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
+        mid = float(seconds_of(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
     late = 0.0 if clock.late is None else delay * clock.late.detach().cpu().numpy()
     return mid + (t - mid - offset - late) / (1.0 + skew)
 
 
-def clock_unknowns(residual: Residual) -> list[Variable]:
-    """What is unknown of the times of a residual."""
-    return list(residual.clock.unknowns)
-
-
 def variables_of(residual: Residual) -> list[Variable]:
     """The unknowns of a residual besides splines."""
-    return [x for x in (*residual.arguments.values(), *clock_unknowns(residual)) if isinstance(x, Variable)]
-
-
-def _seconds(t: Tensor, origin: float | int) -> Array:
-    if t.dtype == torch.int64:
-        return (t - int(origin)).numpy().astype(np.float64) * NANOSECOND
-    return (t.to(torch.float64) - origin).numpy()
+    return [x for x in (*residual.arguments.values(), *residual.clock.unknowns) if isinstance(x, Variable)]
 
 
 def _with_late(clock: Clock, late: Tensor) -> Clock:

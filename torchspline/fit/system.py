@@ -26,6 +26,10 @@ class Rows(NamedTuple):
     #: Control points that a row's local coordinates span.
     span: int
 
+    def arguments(self, chain: Array) -> tuple[Any, ...]:
+        """In the order in which `add_to_band` and `add_to_blocks` take them."""
+        return self.rows, self.starts, self.bases, chain, self.span, chain.shape[-1], self.columns
+
 
 class SingularError(Exception):
     """A matrix that should have been positive definite was not."""
@@ -92,7 +96,7 @@ class BandSystem(System):
 
     def add(self, rows: Rows, chain: Array) -> None:
         outside = add_to_band(
-            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns,
+            self.fused, *rows.arguments(chain),
             self.band, self.border, self.corner, self.right,
         )  # fmt: skip
         if outside:
@@ -226,9 +230,7 @@ class SparseSystem(System):
     def add(self, rows: Rows, chain: Array) -> None:
         size = rows.columns.shape[1]
         blocks = np.empty((len(rows.columns), size, size))
-        add_to_blocks(
-            self.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], rows.columns, blocks, self.right
-        )
+        add_to_blocks(self.fused, *rows.arguments(chain), blocks, self.right)
         i = np.repeat(rows.columns, size, axis=1).reshape(-1)
         j = np.tile(rows.columns, (1, size)).reshape(-1)
         self._keep(i, j, blocks.reshape(-1))
@@ -287,7 +289,3 @@ class SparseFactor(Factor):
         unit = np.zeros((self._lu.shape[0], len(needed)))
         unit[needed, np.arange(len(needed))] = 1.0
         return self._lu.solve(unit)[i, which.reshape(j.shape)]
-
-
-def rows_of(rows: Rows) -> tuple[Array, Array, Array]:
-    return rows.rows, rows.starts, rows.bases

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import NANOSECOND, Model, State, seconds
+from torchspline.fit.model import Model, State, seconds, seconds_of
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
@@ -46,14 +46,11 @@ class Term:
         kind = type(residual)
         tau = seconds_of(residual.t.detach().cpu().reshape(kind.moments, -1), origin).numpy()
         self.order = np.argsort(tau[0], kind="stable")
-        if np.array_equal(self.order, np.arange(len(self.order))):
-            self.order = np.arange(len(self.order))
         self.tau = np.ascontiguousarray(tau[:, self.order])
         mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing
         self.mid = 0.5 * length if mid is None else seconds(mid, origin)
         self.measured = residual.measured.detach().cpu().to(torch.float64).numpy()[self.order]
         self.index = {slot: x[self.order] for slot, x in index.items()}
-        self.weights = self._weights()
         #: Known arguments of which each measurement has its own.
         self.each = {
             slot for slot, x in residual.arguments.items() if isinstance(x, torch.Tensor) and x.ndim == 2
@@ -63,6 +60,7 @@ class Term:
             for slot, x in residual.arguments.items()
         )
         self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
+        self.weights = self._weights()
         self.clock = [v for v in residual.clock.unknowns if id(v) in model.columns]
         self.splines = {
             slot: next(s for s in model.splines if s.module is x)
@@ -87,13 +85,10 @@ class Term:
         if root is None:
             return None
         weights = root.detach().cpu().numpy()
-        rows = self.kernel_rows()
+        rows = self.kernel.rows
         if weights.ndim < 2 or (weights.shape == (rows, rows) and self.residual.weighting[0] != "sigma"):
             return weights.reshape(1, *(weights.shape or (1,)))
         return weights[self.order]
-
-    def kernel_rows(self) -> int:
-        return type(self.residual).sizes(self.model.trajectory.group)[0]
 
     # ------------------------------------------------------------------ where
 
@@ -324,10 +319,3 @@ def _chunks(starts: Array, size: int) -> Iterator[tuple[int, int, int, int]]:
         last = min(max(last, first + 1), runs)
         yield int(starts[first]), int(starts[last]), first, last
         first = last
-
-
-def seconds_of(t: torch.Tensor, origin: float | int) -> torch.Tensor:
-    """Times as seconds from the origin, float64."""
-    if t.dtype == torch.int64:
-        return (t - int(origin)).to(torch.float64) * NANOSECOND
-    return t.to(torch.float64) - origin

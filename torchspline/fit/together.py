@@ -12,25 +12,21 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.model import Model, Spline, State
+from torchspline.fit.model import Model, Spline, State, with_points
 from torchspline.fit.priors import Prior, steps_of
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Residual
-from torchspline.fit.solver import _LEAST_DIAGONAL, _MOST_DAMPING, Options
-from torchspline.fit.streams import clock_unknowns
-from torchspline.fit.system import Rows, rows_of
+from torchspline.fit.solver import LEAST_DIAGONAL, MOST_DAMPING, Options
+from torchspline.fit.system import Rows
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.kernels.assemble import add_to_band
 from torchspline.splines.bspline import BSpline
 
 Array = NDArray[Any]
-
-
 #: What a system has of each trajectory.
 _BLOCKS = ("band", "border", "corner", "cost", "inner", "outer")
 
@@ -59,7 +55,7 @@ class BatchProblem:
         self.trajectories = trajectories
         self._residuals: list[tuple[Residual, Array]] = []
         # One trajectory stands for all where arguments are checked.
-        self._first = Problem(_like(trajectories, points.detach()[0]))
+        self._first = Problem(with_points(trajectories, points.detach()[0]))
 
     def add(self, residual: Residual, trajectory: Tensor) -> Residual:
         """Add measurements; returns the residual.
@@ -84,7 +80,7 @@ class BatchProblem:
                         f"{slot}: expected a Variable with a row for each of {B} trajectories, got {x!r}"
                     )
                 index[slot] = trajectory
-        if clock_unknowns(residual):
+        if residual.clock.unknowns:
             raise ValueError(
                 f"clock: expected a known one in a batch, got {residual.name} with unknowns of time"
             )
@@ -187,6 +183,9 @@ class _System:
     """Normal equations of B independent problems with n columns of splines and m of variables each."""
 
     def __init__(self, model: Model, columns: Array, B: int, width: int):
+        from scipy.linalg import lapack  # as long to import as the rest of the library
+
+        self._lapack = lapack
         self.model, self.B, self.n, self.m = model, B, model.band // B, columns.shape[1]
         self.band, self.border = np.zeros((model.band, width)), np.zeros((model.band, self.m))
         self.corner, self.cost = np.zeros((B, self.m, self.m)), np.zeros(B)
@@ -203,7 +202,7 @@ class _System:
         # Sums over all trajectories, of which the part of the splines and the border keep them apart.
         right, corner = np.zeros(n + self.m), np.zeros((self.m, self.m))
         outside = add_to_band(
-            self.model.trajectory.local.fused, *rows_of(rows), chain, rows.span, chain.shape[-1], shared,
+            self.model.trajectory.local.fused, *rows._replace(columns=shared).arguments(chain),
             self.band, self.border, corner, right,
         )  # fmt: skip
         assert not outside
@@ -248,13 +247,13 @@ class _System:
         damped[:, 0] += damping[:, :n].reshape(-1)
         failed = np.zeros(B, bool)
         while True:
-            chol, info = lapack.dpbtrf(damped.T, lower=1)
+            chol, info = self._lapack.dpbtrf(damped.T, lower=1)
             if not info:
                 break
             bad = (info - 1) // n  # that one is left out, the others go on
             failed[bad] = True
             damped[bad * n : (bad + 1) * n] = np.eye(1, damped.shape[1])
-        follow = lapack.dpbtrs(chol, self.border, lower=1)[0] if self.m else self.border
+        follow = self._lapack.dpbtrs(chol, self.border, lower=1)[0] if self.m else self.border
         border, apart = self.border.reshape(B, n, self.m), follow.reshape(B, n, self.m)
         complement = self.corner - border.transpose(0, 2, 1) @ apart
         complement[:, np.arange(self.m), np.arange(self.m)] += damping[:, n:]
@@ -265,7 +264,7 @@ class _System:
         """Steps (B, n + m), and for which trajectories there is none."""
         B, n = self.B, self.n
         chol, apart, corner, failed = self.factor(damping)
-        inner = lapack.dpbtrs(chol, self.inner, lower=1)[0].reshape(B, n)
+        inner = self._lapack.dpbtrs(chol, self.inner, lower=1)[0].reshape(B, n)
         if self.m:
             left = self.outer - np.einsum("bnm,bn->bm", self.border.reshape(B, n, self.m), inner)
             solved = torch.cholesky_solve(torch.from_numpy(left)[..., None], torch.from_numpy(corner))
@@ -285,7 +284,7 @@ class _Linearizer:
         self.spline, self.B = spline, spline.batch
         self.variables = list(problem.variables.values())
         self.model = Model([spline], self.variables, {})
-        self.priors: list[Prior] = problem._first._priors
+        self.priors: list[Prior] = problem._first.priors
         each = [self.model.columns[id(v)] for v in self.variables]
         self.columns = np.concatenate([np.zeros((self.B, 0), np.int64), *each], axis=1)
         self.terms, self.which = [], []
@@ -299,7 +298,7 @@ class _Linearizer:
         points = self.module.group.normalize(self.module.control_points.detach().to(torch.float64))
         values = {id(v): v.points(v.value) for v in self.variables}
         flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).numpy())
-        return self.model._prepared({id(self.module): flat}, values)
+        return self.model.prepared({id(self.module): flat}, values)
 
     def moved(self, state: State, step: Array) -> State:
         full = np.empty(self.model.total)
@@ -377,7 +376,7 @@ def _minimise(linearize: _Linearizer, options: Options) -> tuple[State, BatchRes
         if not active.any():
             break
         iterations += active
-        scale = np.maximum(diagonal, _LEAST_DIAGONAL * diagonal.max(axis=1, initial=0.0, keepdims=True))
+        scale = np.maximum(diagonal, LEAST_DIAGONAL * diagonal.max(axis=1, initial=0.0, keepdims=True))
         scale[~(scale > 0.0)] = 1.0
         shares = damping[:, None] * scale
         step, failed = system.step(shares)
@@ -397,7 +396,7 @@ def _minimise(linearize: _Linearizer, options: Options) -> tuple[State, BatchRes
         damping = np.where(better, np.maximum(lowered, 1e-15), damping * growth)
         growth = np.where(better, 2.0, 2 * growth)
         stop(better & (fall < options.cost), f"the cost fell by less than {options.cost:g} of itself", True)
-        stop(damping > _MOST_DAMPING, "no step lowers the cost, however small", False)
+        stop(damping > MOST_DAMPING, "no step lowers the cost, however small", False)
     covariances = _covariances(linearize, system)
     before, after, done, tried = map(torch.from_numpy, (initial, system.cost, converged, iterations))
     return state, BatchResult(before, after, done, tried, list(reason), covariances)
@@ -426,14 +425,6 @@ def _shifted(residual: Residual, which: Array, trajectories: BSpline) -> Residua
         assert trajectories.dt is not None
         new.t = residual.t + b.to(torch.float64) * (points * float(trajectories.dt.detach()))
     return new
-
-
-def _like(trajectories: BSpline, points: Tensor) -> BSpline:
-    start = trajectories.domain[0]
-    options: dict[str, Any] = {"dt_ns": trajectories.dt_ns, "t0_ns": start}
-    if trajectories.dt is not None:
-        options = {"dt": float(trajectories.dt.detach()), "t0": start}
-    return BSpline(points, group=trajectories.group, order=trajectories.order, learnable=False, **options)
 
 
 def _which(name: str, x: Any, count: int, B: int) -> Array:

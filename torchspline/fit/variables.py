@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -55,11 +54,6 @@ class Variable:
 
     # ------------------------------------------------------------------ what the solver does with one
 
-    @property
-    def cotangent_size(self) -> int:
-        """Numbers of a cotangent as residuals give it: of a body tangent, or of plain numbers."""
-        return self.group.tangent_size if self.group is not None else self.size
-
     def points(self, value: Tensor) -> Tensor:
         """Unit representatives."""
         return value if self.group is None else self.group.normalize(value)
@@ -87,8 +81,3 @@ class Variable:
             moved = value + (basis.reshape(*value.shape[:-1], 3, 2) @ step.unsqueeze(-1)).squeeze(-1)
             return moved * (value.norm(dim=-1, keepdim=True) / moved.norm(dim=-1, keepdim=True))
         return value + step
-
-
-def as_array(x: Tensor) -> Array:
-    """The numbers of a tensor on the CPU, in order."""
-    return np.ascontiguousarray(x.detach().numpy())

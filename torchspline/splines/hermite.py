@@ -41,9 +41,8 @@ Coordinates = Literal["product", "logarithm"]
 Frame = Literal["body", "world"]
 
 _HALF = Fraction(1, 2)
-#: [E17] (60)-(65): a_1 ... a_5 by powers of u. Each is one of value, velocity and acceleration at an end and
-#: zero in the
-#: others: a_1 the value at 1, a_2 and a_3 the velocity at 0 and 1, a_4 and a_5 the acceleration.
+#: [E17] (60)-(65): a_1 ... a_5 by powers of u. Each is 1 in one of value, velocity and acceleration at one end,
+#: 0 in the others: a_1 in the value at 1, a_2 and a_3 in the velocity at 0 and 1, a_4 and a_5 in the acceleration.
 QUINTICS: tuple[tuple[Fraction | int, ...], ...] = (
     (0, 0, 0, 10, -15, 6),
     (0, 1, 0, -6, 8, -3),
@@ -204,7 +203,7 @@ def _evaluate(
         return lambda segment, u: _fields(rows_at(expanded, segment), u, group, coordinates, needed)
 
     state = evaluate_segments(
-        curve, group, t, times, values_batch(knots[0]), knots[0].dtype, derivatives, extrapolate, validate
+        curve, group, t, times, _batch(knots[0]), knots[0].dtype, derivatives, extrapolate, validate
     )
     if frame == "body":
         return state
@@ -212,7 +211,7 @@ def _evaluate(
     return State(value, *(None if r is None else -r for r in state[1:]))
 
 
-def values_batch(values: Tensor) -> torch.Size:
+def _batch(values: Tensor) -> torch.Size:
     return values.shape[:-2]
 
 
@@ -249,13 +248,13 @@ def _check_knots(
 class Differentials(NamedTuple):
     """Jacobians of a Hermite spline at N times by the knots at the ends of their segments.
 
-    `segment` (*batch, N): knot i and i + 1 are those of segment i. `jacobian` (*batch, N, 3, 6, D, D): of
-        value, velocity
-    and acceleration (third to last but one dimension) by value, velocity and acceleration of the knots, in the order
-    X_i, X_(i+1), v_i, v_(i+1), a_i, a_(i+1); rows belong to the output, columns to the parameter.
+    Rates are per second; values, of knots and of the spline, move by tangents of the `side` asked for.
     """
 
+    #: (*batch, N): segment i lies between knots i and i + 1.
     segment: Tensor
+    #: (*batch, N, 3, 6, D, D): value, velocity and acceleration of the spline by X_i, X_(i+1), v_i, v_(i+1), a_i and
+    #: a_(i+1) of the knots; rows belong to the output, columns to the parameter.
     jacobian: Tensor
 
 
@@ -313,9 +312,7 @@ class HermiteSpline(Trajectory):
         """Value and time derivatives at the times `t`, see `hermite`; rates in the body frame, or in the world frame
         (`dX/dt X^-1` and its derivatives, as in [E17] (33), (36))."""
         checks.choice("frame", frame, ("body", "world"))
-        check_query(
-            t, derivatives, self.extrapolate, self.validate, self.values, values=values_batch(self.values)
-        )
+        check_query(t, derivatives, self.extrapolate, self.validate, self.values, values=_batch(self.values))
         state = _evaluate(
             self._knots, t, self.group, self.times, self.coordinates, self.frame, derivatives, self.extrapolate,
             self.validate,
@@ -340,12 +337,12 @@ class HermiteSpline(Trajectory):
             ValueError: a time outside the domain.
         """
         checks.choice("side", side, ("left", "right"))
-        check_query(t, 2, "error", True, self.values, values=values_batch(self.values))
+        check_query(t, 2, "error", True, self.values, values=_batch(self.values))
         group, knots, times = self.group, self._knots, self.times.detach()
         knots = tuple(x.detach() for x in knots)  # type: ignore[assignment]
         if self.frame == "world":
             knots = _from_world(*knots, group)  # type: ignore[assignment]
-        t = t.detach().reshape(-1) if t.ndim == 0 or len(values_batch(knots[0])) == 0 else t.detach()
+        t = t.detach().reshape(-1) if t.ndim == 0 or len(_batch(knots[0])) == 0 else t.detach()
         place = locate_between(t, times, "error", True)
         u, h = (x.to(knots[0].dtype) for x in (place.u, place.duration))
         ends = _Ends(*(rows_at(x, place.segment) for x in _ends(*knots, times, group)))
@@ -418,6 +415,3 @@ def _logarithm_differentials(ends: _Ends, u: Tensor, group: Group) -> Tensor:
         return torch.stack([step, *rates], dim=-2)
 
     return torch.func.jacfwd(outputs)(origin).movedim(-2, -3)
-
-
-__all__ = ["Differentials", "HermiteSpline", "hermite"]

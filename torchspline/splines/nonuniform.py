@@ -23,9 +23,8 @@ from torchspline.splines.trajectory import State, Trajectory
 
 
 def local_knots(knots: Tensor, order: int) -> Tensor:
-    """For each segment between neighbouring knots of the domain the 2 (k - 1) knots its basis functions need,
-    as places u
-    within the segment: `(S, 2 (k - 1))`, float64. Those of an empty segment are of no use."""
+    """For each segment between neighbouring knots of the domain the 2 (k - 1) knots its basis functions need, as places
+    u within the segment: `(S, 2 (k - 1))`, float64. Those of an empty segment are of no use."""
     knots = knots.to(torch.float64)
     windows = knots.unfold(0, 2 * order - 2, 1)[1:-1] if order > 1 else knots[:, None]
     start, end = windows[:, order - 2 : order - 1], windows[:, order - 1 : order]
@@ -265,6 +264,3 @@ class NonuniformBSpline(Trajectory):
             new, group=self.group, knots=added, order=k, learnable=isinstance(self.control_points, nn.Parameter),
             extrapolate=self.extrapolate, validate=self.validate,
         )  # fmt: skip
-
-
-__all__ = ["NonuniformBSpline", "nonuniform_bspline"]

@@ -28,29 +28,21 @@ class Place(NamedTuple):
     beyond: Tensor | None
 
 
-def check_knot_times(times: Any, count: int | None, name: str = "times", what: str = "knots") -> Tensor:
-    """Times of knots: `(M,)` seconds, finite and increasing.
-
-    Args:
-        count: how many there have to be; None: two or more.
-    """
-    checks.is_floating_tensor(name, times)
-    if times.ndim != 1 or (count is not None and times.shape[0] != count):
-        size = "M" if count is None else count
+def check_knot_times(times: Any, count: int, what: str = "knots") -> None:
+    """Times of `count` knots, `(count,)` seconds: an error unless they are finite and increasing."""
+    checks.is_floating_tensor("times", times)
+    if times.shape != (count,):
         raise ValueError(
-            f"{name}: expected shape ({size},), one time for each of the {what}, got {tuple(times.shape)}"
+            f"times: expected shape ({count},), one time for each of the {what}, got {tuple(times.shape)}"
         )
-    if times.shape[0] < 2:
-        raise ValueError(f"{name}: expected the times of at least two {what}, got {times.shape[0]}")
-    checks.finite(name, times)
+    checks.finite("times", times)
     later = times.detach().diff() > 0
     if checks.values_visible(times) and checks.seen_true(later.all()) is False:
         i = int(later.int().argmin())
         raise ValueError(
-            f"{name}: expected increasing times, got {times[i].item()} and then {times[i + 1].item()}; sort them and "
+            f"times: expected increasing times, got {times[i].item()} and then {times[i + 1].item()}; sort them and "
             "drop duplicates first"
         )
-    return times
 
 
 def check_query(

@@ -2,9 +2,8 @@
 
 from torchspline.fit.residual import Residual
 from torchspline.fit.residuals.accelerometer import Accelerometer
-from torchspline.fit.residuals.angular_acceleration import AngularAcceleration
+from torchspline.fit.residuals.angular_rate import AngularAcceleration, Gyroscope
 from torchspline.fit.residuals.direction import Direction
-from torchspline.fit.residuals.gyroscope import Gyroscope
 from torchspline.fit.residuals.orientation import Orientation
 from torchspline.fit.residuals.point import Point
 from torchspline.fit.residuals.pose import Pose

@@ -6,8 +6,8 @@ from typing import ClassVar
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS, Motion, attached, attached_reverse
 from torchspline.arithmetic.so3 import rotate, unrotate
-from torchspline.arithmetic.vector import Vector, add, cross, negate, zero
-from torchspline.fit.residual import Moment, Residual, Slot
+from torchspline.arithmetic.vector import Vector, add, cross, negate
+from torchspline.fit.residual import LEVER_ARM, Moment, Residual, Slot
 from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 
@@ -25,7 +25,7 @@ class Accelerometer(Residual):
     slots: ClassVar = {
         **TRIAD,
         "gravity": Slot(3, None, STANDARD_GRAVITY),
-        "lever_arm": Slot(3, None, zero(3)),
+        "lever_arm": LEVER_ARM,
     }
 
     def _force(

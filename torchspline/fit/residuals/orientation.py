@@ -8,7 +8,7 @@ from torchspline.arithmetic.motion import MOTIONS, Motion
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.so3 import conjugate, multiply, rotate, unit
 from torchspline.arithmetic.vector import Vector
-from torchspline.fit.residual import Moment, Residual, Slot, needs
+from torchspline.fit.residual import ROTATION_IN_BODY, Moment, Residual, needs
 from torchspline.groups.group import Group
 
 
@@ -23,7 +23,7 @@ class Orientation(Residual):
 
     rows, measured_size, derivatives = 3, 4, 0
     measured_signs = ((0, 4),)
-    slots: ClassVar = {"rotation": Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0))}
+    slots: ClassVar = {"rotation": ROTATION_IN_BODY}
 
     @classmethod
     def check_group(cls, group: Group) -> None:

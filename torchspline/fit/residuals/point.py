@@ -6,7 +6,7 @@ from typing import ClassVar
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual, Slot
 
 
 class Point(Residual):
@@ -20,7 +20,7 @@ class Point(Residual):
     rows, measured_size, derivatives = 3, 3, 0
     slots: ClassVar = {
         "landmark": Slot(3, None, None),
-        "T_body_sensor": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+        "T_body_sensor": POSE_IN_BODY,
     }
 
     def evaluate(

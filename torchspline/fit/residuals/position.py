@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS, Motion, attached, attached_reverse
-from torchspline.arithmetic.vector import Vector, add, negate, zero
-from torchspline.fit.residual import Moment, Residual, Slot, needs
+from torchspline.arithmetic.vector import Vector, add, negate
+from torchspline.fit.residual import LEVER_ARM, Moment, Residual, needs
 from torchspline.groups.group import Group
 
 
@@ -19,7 +19,7 @@ class Position(Residual):
     """
 
     rows, measured_size, derivatives = 3, 3, 0
-    slots: ClassVar = {"lever_arm": Slot(3, None, zero(3))}
+    slots: ClassVar = {"lever_arm": LEVER_ARM}
 
     @classmethod
     def check_group(cls, group: Group) -> None:

@@ -8,7 +8,7 @@ from torchspline.arithmetic.motion import MOTIONS, Motion
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.so3 import conjugate, multiply, rotate, unit, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate
-from torchspline.fit.residual import Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual
 
 
 class RelativePose(Residual):
@@ -23,7 +23,7 @@ class RelativePose(Residual):
 
     rows, measured_size, derivatives, moments = 6, 7, 0, 2
     measured_signs = ((3, 7),)
-    slots: ClassVar = {"T_body_sensor": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))}
+    slots: ClassVar = {"T_body_sensor": POSE_IN_BODY}
 
     def _between(
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector]

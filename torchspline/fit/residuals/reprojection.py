@@ -9,7 +9,7 @@ from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
 from torchspline.arithmetic.scalar import Scalar, sqrt, where
 from torchspline.arithmetic.series import arctan_factor
 from torchspline.arithmetic.vector import Vector, add, dot, negate, scale, times
-from torchspline.fit.residual import Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual, Slot
 
 #: (tan 89.94 degrees)^-2: a pinhole sees nothing that lies so far aside.
 _ASIDE = 1e-6
@@ -22,7 +22,7 @@ class _Reprojection(Residual):
     slots: ClassVar = {
         "landmark": Slot(3, None, None),
         "intrinsics": Slot(8, None, None),
-        "T_body_camera": Slot(7, "SE3", (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+        "T_body_camera": POSE_IN_BODY,
     }
 
     @staticmethod

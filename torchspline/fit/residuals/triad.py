@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from torchspline.arithmetic.motion import turned, turned_reverse
 from torchspline.arithmetic.vector import Vector, add, dot, scale, zero
-from torchspline.fit.residual import Slot
+from torchspline.fit.residual import ROTATION_IN_BODY, Slot
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -12,7 +12,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 #: of the axes.
 TRIAD = {
     "bias": Slot(3, None, zero(3)),
-    "rotation": Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0)),
+    "rotation": ROTATION_IN_BODY,
     "scaling": Slot(9, None, IDENTITY),
 }
 

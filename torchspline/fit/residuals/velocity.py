@@ -13,8 +13,8 @@ from torchspline.arithmetic.motion import (
     turned_reverse,
 )
 from torchspline.arithmetic.so3 import rotate, unrotate
-from torchspline.arithmetic.vector import Vector, add, cross, negate, zero
-from torchspline.fit.residual import Moment, Residual, Slot, needs
+from torchspline.arithmetic.vector import Vector, add, cross, negate
+from torchspline.fit.residual import LEVER_ARM, ROTATION_IN_BODY, Moment, Residual, needs
 from torchspline.groups.group import Group
 
 
@@ -26,7 +26,7 @@ class WorldVelocity(Residual):
     """
 
     rows, measured_size, derivatives = 3, 3, 1
-    slots: ClassVar = {"lever_arm": Slot(3, None, zero(3))}
+    slots: ClassVar = {"lever_arm": LEVER_ARM}
 
     @classmethod
     def check_group(cls, group: Group) -> None:
@@ -64,7 +64,7 @@ class BodyVelocity(Residual):
     """
 
     rows, measured_size, derivatives = 3, 3, 1
-    slots: ClassVar = {"rotation": Slot(4, "SO3", (1.0, 0.0, 0.0, 0.0)), "lever_arm": Slot(3, None, zero(3))}
+    slots: ClassVar = {"rotation": ROTATION_IN_BODY, "lever_arm": LEVER_ARM}
 
     def evaluate(
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
