@@ -130,6 +130,22 @@ def test_residuals_come_in_the_order_of_the_measurements():
     assert "not converged" in repr(result)
 
 
+def test_residuals_of_no_measurements():
+    problem, *_ = inertial_problem()
+    problem.add(Gyroscope(torch.zeros(0, dtype=F64), torch.zeros(0, 3, dtype=F64), name="none"))
+    assert problem.solve(max_iterations=2).residuals["none"].shape == (0, 3)
+
+
+def test_covariance_stays_that_of_the_solution():
+    """Wherever the trajectory goes afterwards."""
+    problem, *_ = inertial_problem()
+    result, t = problem.solve(), torch.linspace(0.0, 2.7, 7, dtype=F64)
+    before = result.trajectory_covariance(t, 1)
+    with torch.no_grad():
+        problem.trajectory.control_points.copy_(SE3.random(12))
+    assert_allclose(result.trajectory_covariance(t, 1), before, rtol=1e-12)
+
+
 def test_open_directions_are_named():
     """A gyroscope says nothing of the rotation it started from, and nothing of a bias that moves along."""
     spline = trajectory(SO3)

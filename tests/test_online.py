@@ -1,6 +1,8 @@
 """Sliding windows against batch solutions, dense elimination, Kalman's formulas and counting."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -401,6 +403,35 @@ def test_a_skew_needs_a_middle_that_stays():
     with pytest.raises(ValueError, match=r"expected Clock\(mid=...\)"):
         window.add(StateValue(t, random(2, 3), clock=Clock(skew=skew)))
     window.add(StateValue(t, random(2, 3), clock=Clock(skew=skew, mid=0.0)))
+
+
+def test_buffers_of_packets_may_be_used_again():
+    window, other = (SlidingWindow(torch.zeros(3, dtype=F64), group=R3, dt=0.1) for _ in range(2))
+    t, y = torch.zeros(4, dtype=F64), torch.zeros(4, 3, dtype=F64)
+    for i in range(3):
+        t.copy_(0.1 * i + torch.arange(4) * 0.02)
+        y.copy_(random(4, 3, seed=i))
+        window.add(StateValue(t, y, sigma=0.1))
+        other.add(StateValue(t.clone(), y.clone(), sigma=0.1))
+    for x in (window, other):
+        x.update(**EXACT)
+    assert_allclose(window.trajectory.control_points, other.trajectory.control_points, atol=1e-15)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_keep_random_walks(copied):
+    window = SlidingWindow(SO3.identity(dtype=F64), group=SO3, dt=0.1, window=0.3)
+    bias = Variable("bias", torch.zeros(3, dtype=F64))
+    window.random_walk(bias, 0.1)
+    window.add(Gyroscope(torch.arange(30, dtype=F64) * 0.02, random(30, 3), sigma=0.1, bias=bias))
+    window.add_prior(bias, sigma=0.1)
+    other = copied(window)
+    found = []
+    for x in (window, other):
+        x.add(StateValue(torch.zeros(1, dtype=F64), SO3.identity(dtype=F64)[None], sigma=0.1))
+        x.update()
+        found.append(x.update().covariance(x.variables["bias"]))
+    assert_allclose(found[1], found[0], rtol=1e-9)
 
 
 def test_packets_of_one_kind_are_kept_together():

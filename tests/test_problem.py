@@ -1,5 +1,8 @@
 """Normal equations of whole problems against dense ones by automatic differentiation, whatever they are made of."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -194,6 +197,43 @@ def test_a_residual_that_is_refused_leaves_no_trace():
         problem.add(Accelerometer(t, normal(9, 3, seed=1), **new))
     assert list(problem.variables) == ["bias"]
     assert len(problem.residuals) == 1
+
+
+def test_names_that_reports_give_to_splines_are_refused():
+    spline = trajectory(SE3)
+    problem, t = Problem(spline), spread(spline, 9)
+    for name in ("trajectory", "spline 1"):
+        with pytest.raises(ValueError, match="expected another name"):
+            problem.add(Gyroscope(t, normal(9, 3, seed=1), bias=Variable(name, torch.zeros(3))))
+    assert not problem.variables
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_keep_frozen_parts(copied):
+    spline, bias = trajectory(SE3), Variable("bias", normal(3, seed=1))
+    problem, t = Problem(spline), spread(spline, 20)
+    problem.add(Gyroscope(t, normal(20, 3, seed=1), bias=bias))
+    keep = torch.arange(12) < 5
+    problem.freeze(spline, keep)
+    problem.freeze(bias)
+    other = copied(problem)
+    other.solve(max_iterations=2)
+    torch.testing.assert_close(other.variables["bias"].value, bias.value, rtol=0, atol=0)
+    before, after = (x.trajectory.control_points.detach() for x in (problem, other))
+    torch.testing.assert_close(after[keep], before[keep], rtol=0, atol=0)
+    assert (after - before)[~keep].abs().max() > 0
+    other.release(other.trajectory)
+    assert other.prepare().model.total == 12 * 6
+
+
+def test_one_variable_for_two_parts_of_a_clock():
+    spline = trajectory(SE3)
+    t = spread(spline, 20).clamp(spline.domain[0] + 0.2, spline.domain[1] - 0.2)
+    v = Variable("lag", torch.full((1,), 0.01, dtype=torch.float64))
+    problem = Problem(spline)
+    clock = Clock(offset=v, delay=v, late=normal(20, seed=3))
+    problem.add(Pose(t, SE3.random(20, generator=generator(5)), clock=clock))
+    check_assembly(problem)
 
 
 def test_the_order_of_arguments_does_not_matter():

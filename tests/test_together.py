@@ -156,6 +156,20 @@ def test_covariances_that_the_data_leave_open_are_nan():
     assert covariance[1].diagonal().min() > 0
 
 
+def test_covariance_of_a_trajectory_without_measurements_is_nan():
+    truth = windows(SE3, 3)
+    bias = Variable("bias", torch.zeros(3, 3, dtype=F64))
+    t = torch.linspace(0.0, 1.0, 60, dtype=F64)
+    problem = BatchProblem(truth)
+    for b in range(2):
+        gyro = ts.imu.measure(single(truth, b), t).gyroscope
+        problem.add(Gyroscope(t, gyro, sigma=0.01, bias=bias), torch.full((60,), b))
+        problem.add(StateValue(t, truth(t)[b], sigma=0.01), torch.full((60,), b))
+    covariance = problem.solve().covariance(bias)
+    assert covariance[:2].isfinite().all()
+    assert covariance[2].isnan().all()
+
+
 def test_what_a_batch_does_not_take_is_refused():
     truth = windows(SE3, 3)
     t, gyro = torch.linspace(0.0, 1.0, 5, dtype=F64), torch.zeros(5, 3, dtype=F64)

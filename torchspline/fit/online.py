@@ -100,7 +100,7 @@ class SlidingWindow:
         #: What was added beforehand or remembered; parts of the trajectory are of `_anchor`.
         self._priors: list[Prior] = []
         self._anchor = self.active
-        self._walks: dict[int, Array] = {}
+        self._walks: dict[Variable, Array] = {}
 
     def __repr__(self) -> str:
         start, end = self.active.domain
@@ -180,7 +180,8 @@ class SlidingWindow:
         probe.add(residual, **index)
         self._append(more)
         self._variables.update({v.name: v for v in variables_of(residual)})
-        stream = Stream(residual, dict(index))
+        # A copy of the measurements: buffers that packets arrive in may be used again.
+        stream = Stream(residual, dict(index)).select(torch.ones(len(residual), dtype=torch.bool))
         for i, other in enumerate(self._streams):
             joined = other.join(stream)
             if joined is not None:
@@ -234,7 +235,7 @@ class SlidingWindow:
         """
         checks.instance("variable", variable, Variable, "a torchspline.fit.Variable")
         count = variable.value.shape[:-1].numel()
-        self._walks[id(variable)] = np.tile(_per_component("sigma", sigma, variable.dimension), (count, 1))
+        self._walks[variable] = np.tile(_per_component("sigma", sigma, variable.dimension), (count, 1))
 
     def extend(self, t: float | int) -> None:
         """Append control points up to a time: the last step from one to the next is repeated.
@@ -383,8 +384,8 @@ class SlidingWindow:
         for variable in variables.values():
             own = model.columns[id(variable)]
             parts.append(Part(variable, np.arange(len(own)), _rows(variable)))
-            if id(variable) in self._walks:
-                variance = np.square(self._walks[id(variable)]).reshape(-1) * (excess * self._spacing)
+            if variable in self._walks:
+                variance = np.square(self._walks[variable]).reshape(-1) * (excess * self._spacing)
                 H, g, now[own.reshape(-1)] = random_walk(H, g, own.reshape(-1), variance)
             keep.append(own.reshape(-1))
         order = np.concatenate(keep).astype(np.int64) if keep else np.zeros(0, np.int64)

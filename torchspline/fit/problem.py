@@ -1,5 +1,6 @@
 """A least-squares problem: a trajectory, what was measured of it, and what else is unknown."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +27,8 @@ Array = NDArray[Any]
 #: Beyond these the equations are no band with a narrow border any more, and go to a sparse factorisation.
 _WIDEST_BORDER = 300
 _WIDEST_BAND = 6
+#: Names of splines in `Result.observability`.
+_RESERVED = re.compile(r"trajectory|spline \d+")
 
 
 class Problem:
@@ -40,7 +43,8 @@ class Problem:
         self.trajectory = trajectory
         self.residuals: list[Residual] = []
         self._indices: list[dict[str, Array]] = []
-        self._frozen: dict[int, Array | bool] = {}
+        #: By the unknowns themselves, not their `id`: copies and pickles of a problem keep them.
+        self._frozen: dict[Unknown, Array | bool] = {}
         self._unknowns: list[Unknown] = [trajectory]
         self.priors: list[Prior] = []
 
@@ -86,6 +90,8 @@ class Problem:
                 _check_spline("spline", x)
             elif any(isinstance(y, Variable) and y.name == x.name for y in known):
                 raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
+            elif _RESERVED.fullmatch(x.name):
+                raise ValueError(f"variable: {x.name!r} is what reports call a spline; expected another name")
             new.append(x)
         self._unknowns += new
 
@@ -151,7 +157,7 @@ class Problem:
         if isinstance(unknown, Variable):
             if points is not None:
                 raise ValueError(f"points: only splines have control points, got {unknown!r}; expected None")
-            self._frozen[id(unknown)] = True
+            self._frozen[unknown] = True
             return
         count = unknown.control_points.shape[-2]
         if points is None:
@@ -161,12 +167,12 @@ class Problem:
             raise TypeError(f"points: expected dtype torch.bool, got {points.dtype}")
         if points.shape != (count,):
             raise ValueError(f"points: expected shape ({count},), got {tuple(points.shape)}")
-        self._frozen[id(unknown)] = points.cpu().numpy()
+        self._frozen[unknown] = points.cpu().numpy()
 
     def release(self, unknown: Unknown) -> None:
         """Undo `freeze`."""
         self._known("unknown", unknown)
-        self._frozen.pop(id(unknown), None)
+        self._frozen.pop(unknown, None)
 
     def _known(self, name: str, unknown: Unknown) -> None:
         if not any(x is unknown for x in self._unknowns):
@@ -229,7 +235,7 @@ class Problem:
                 _check_spline("trajectory" if x is self.trajectory else "spline", x)
         splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
-        model = Model(splines, variables, self._frozen)
+        model = Model(splines, variables, {id(x): kept for x, kept in self._frozen.items()})
         terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
         return Linearizer(model, [*terms, *(prior.bind(model) for prior in self.priors)])
 

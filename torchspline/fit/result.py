@@ -15,6 +15,7 @@ from torchspline.fit.solver import Trace
 from torchspline.fit.system import Factor, SingularError, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
+from torchspline.splines.bspline import BSpline
 
 if TYPE_CHECKING:
     from torchspline.fit.problem import Linearizer
@@ -89,7 +90,8 @@ class Result:
         """
         found: dict[str, Tensor] = {}
         for term in self._terms():
-            rows = torch.from_numpy(np.concatenate([r for _, _, r in term.linearize(self._state)]))
+            chunks = [r for _, _, r in term.linearize(self._state)]
+            rows = torch.from_numpy(np.concatenate([np.empty((0, term.kernel_rows())), *chunks]))
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
@@ -159,7 +161,7 @@ class Result:
         if isinstance(t, Tensor) and t.ndim > 1:
             raise ValueError(f"t: expected shape (N,) or (), got {tuple(t.shape)}")
         spline, trajectory = model.trajectory, model.trajectory.module
-        jacobians = trajectory.jacobians(t, derivatives, side="right")
+        jacobians = self._solved().jacobians(t, derivatives, side="right")
         stacked = torch.cat([x for x in jacobians[1 : 2 + derivatives] if x is not None], dim=-2).double()
         N, k, rows, D = stacked.reshape(-1, *stacked.shape[-3:]).shape
         J = stacked.reshape(N, k, rows, D).transpose(1, 2).reshape(N, rows, k * D).numpy()
@@ -171,6 +173,16 @@ class Result:
         i, j = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
         covariance = torch.from_numpy(J @ self._determined().inverse(i, j) @ J.swapaxes(1, 2))
         return covariance[0] if t.ndim == 0 else covariance
+
+    def _solved(self) -> BSpline:
+        """The trajectory as it was solved for, wherever its module went since."""
+        trajectory = self._linearizer.model.trajectory.module
+        start = trajectory.domain[0]
+        options: dict[str, Any] = {"dt_ns": trajectory.dt_ns, "t0_ns": start}
+        if trajectory.dt is not None:
+            options = {"dt": float(trajectory.dt.detach()), "t0": start}
+        points = torch.from_numpy(self._state.points[id(trajectory)])
+        return BSpline(points, group=trajectory.group, order=trajectory.order, learnable=False, **options)
 
     # ------------------------------------------------------------------ what is left open
 

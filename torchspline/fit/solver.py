@@ -164,5 +164,5 @@ def _step(system: System, damping: Array) -> Array | None:
 def _stationary(system: System, tolerance: float) -> bool:
     """Whether every unknown, the others held, is within so many of its standard deviations of its optimum."""
     diagonal = system.diagonal()
-    moved = np.abs(system.right) > tolerance * np.sqrt(diagonal)
+    moved = np.abs(system.right) > tolerance * np.sqrt(np.maximum(diagonal, 0.0))
     return not bool((moved & (diagonal > 0)).any())

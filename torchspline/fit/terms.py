@@ -145,10 +145,13 @@ class Term:
         ).numpy()
         rate = 1.0 if clock.skew is None else 1.0 + float(numbers[id(clock.skew)])
         rates: list[tuple[Variable, Array]] = []
-        for v in self.clock:
-            if v is clock.offset:
+        for part in ("offset", "skew", "delay"):  # by their names: one variable may be several of them
+            v = getattr(clock, part)
+            if v is None or id(v) not in self.model.columns:
+                continue
+            if part == "offset":
                 rates.append((v, np.full_like(tau, -1.0 / rate)))
-            elif v is clock.skew:
+            elif part == "skew":
                 rates.append((v, -(tau - self.mid) / rate))
             else:
                 assert clock.late is not None

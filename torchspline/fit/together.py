@@ -371,7 +371,7 @@ def _minimise(linearize: _Linearizer, options: Options) -> tuple[State, BatchRes
 
     for _ in range(options.iterations):
         diagonal, right = system.diagonal, system.right
-        far = (np.abs(right) > options.gradient * np.sqrt(diagonal)) & (diagonal > 0)
+        far = (np.abs(right) > options.gradient * np.sqrt(np.maximum(diagonal, 0.0))) & (diagonal > 0)
         stop(~far.any(axis=1), "no unknown could come nearer: the gradient is zero", True)
         if not active.any():
             break
@@ -406,6 +406,7 @@ def _covariances(linearize: _Linearizer, system: _System) -> dict[int, Tensor]:
     if not system.m:
         return {}
     *_, corner, failed = system.factor(np.zeros((system.B, system.n + system.m)))
+    corner[failed] = np.eye(system.m)  # a failed factor may have zeros on its diagonal
     inverse = torch.cholesky_inverse(torch.from_numpy(corner))
     inverse[torch.from_numpy(failed)] = math.nan
     found = {}
