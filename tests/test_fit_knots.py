@@ -1,7 +1,9 @@
 """Which spacing changes between neighbouring fits speak for."""
 
 import pytest
+import torch
 
+from torchspline import SO3, fit_poses
 from torchspline.fit.knots import _least
 
 RATIO = 2**0.5
@@ -26,3 +28,13 @@ def test_the_first_minimum_counts(changes, best):
     assert change == changes[best]
     # The parabola moves it by half a step at most.
     assert RATIO**best * 0.999 < spacing < RATIO ** (best + 1) * 1.001
+
+
+def test_bursts_do_not_ask_for_knots_between_them():
+    """Triples of poses a fraction of a microsecond apart, ten a second."""
+    t = (torch.arange(200, dtype=torch.float64)[:, None] / 10 + 1e-7 * torch.arange(3)).reshape(-1)
+    angle = torch.sin(0.7 * t)[:, None] * torch.tensor([[0.3, 0.1, -0.2]], dtype=torch.float64)
+    poses = torch.cat([torch.cos(0.5 * t)[:, None].expand(-1, 3), SO3.exp(angle)], dim=-1)
+    fit = fit_poses(t, poses, dt="auto", progress=False)
+    assert fit.trajectory.dt > 0.04
+    assert max(fit.rms()) < 1e-3

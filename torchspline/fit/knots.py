@@ -147,7 +147,9 @@ def choose_spacing(
     numbers = measured.numpy() * np.array([1.0] * 3 + [2.0] * 4)  # a turn by x moves a quaternion by x / 2
     steps = times.diff().to(torch.float64)
     steps = steps[steps > 0] * unit
-    span, narrow = float(steps.sum()), _LEAST_POSES * float(steps.median())
+    # Poses may come in bursts, and with gaps between them.
+    usual = steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)]
+    span, narrow = float(steps.sum()), _LEAST_POSES * max(float(steps.median()), float(usual.mean()))
     widest = max(span / _LEAST_INTERVALS, narrow)
     tried: list[float] = []
     misses: list[tuple[float, float]] = []

@@ -91,7 +91,7 @@ class Result:
         found: dict[str, Tensor] = {}
         for term in self._terms():
             chunks = [r for _, _, r in term.linearize(self._state)]
-            rows = torch.from_numpy(np.concatenate([np.empty((0, term.kernel_rows())), *chunks]))
+            rows = torch.from_numpy(np.concatenate([np.empty((0, term.kernel.rows)), *chunks]))
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
