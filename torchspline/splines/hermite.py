@@ -16,7 +16,7 @@ from math import factorial
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchspline import checks
 from torchspline.arithmetic import jet
@@ -27,7 +27,6 @@ from torchspline.groups.group import Group, Side
 from torchspline.groups.operations import geodesics
 from torchspline.splines.clock import Extrapolate
 from torchspline.splines.segments import (
-    Curve,
     check_knot_times,
     check_query,
     evaluate_segments,
@@ -196,23 +195,15 @@ def _evaluate(
     if frame == "world":
         knots = _from_world(*knots, group)  # type: ignore[assignment]
     table = _table(_ends(*knots, times, group), group, coordinates)
-    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
 
-    def curve(common: torch.Size) -> Curve:
-        expanded = table.expand(*common, *table.shape[-2:])
-        return lambda segment, u: _fields(rows_at(expanded, segment), u, group, coordinates, needed)
+    def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
+        return _fields(rows, u, group, coordinates, needed)
 
-    state = evaluate_segments(
-        curve, group, t, times, _batch(knots[0]), knots[0].dtype, derivatives, extrapolate, validate
-    )
+    state = evaluate_segments(table, fields, group, t, times, derivatives, extrapolate, validate)
     if frame == "body":
         return state
     value = group.inverse(state.value, validate=False)
     return State(value, *(None if r is None else -r for r in state[1:]))
-
-
-def _batch(values: Tensor) -> torch.Size:
-    return values.shape[:-2]
 
 
 def _check_knots(
@@ -299,9 +290,7 @@ class HermiteSpline(Trajectory):
         self._adopt("values", values, learnable)
         self._adopt("velocities", velocities, learnable)
         self._adopt("accelerations", accelerations, learnable)
-        if not isinstance(times, nn.Parameter) and not times.requires_grad:
-            times = times.to(torch.float64)
-        self._adopt("times", times, learnable=False)
+        self._adopt_seconds("times", times)
 
     @property
     def domain(self) -> tuple[float, float]:
@@ -312,7 +301,9 @@ class HermiteSpline(Trajectory):
         """Value and time derivatives at the times `t`, see `hermite`; rates in the body frame, or in the world frame
         (`dX/dt X^-1` and its derivatives, as in [E17] (33), (36))."""
         checks.choice("frame", frame, ("body", "world"))
-        check_query(t, derivatives, self.extrapolate, self.validate, self.values, values=_batch(self.values))
+        check_query(
+            t, derivatives, self.extrapolate, self.validate, self.values, values=self.values.shape[:-2]
+        )
         state = _evaluate(
             self._knots, t, self.group, self.times, self.coordinates, self.frame, derivatives, self.extrapolate,
             self.validate,
@@ -337,12 +328,12 @@ class HermiteSpline(Trajectory):
             ValueError: a time outside the domain.
         """
         checks.choice("side", side, ("left", "right"))
-        check_query(t, 2, "error", True, self.values, values=_batch(self.values))
+        check_query(t, 2, "error", True, self.values, values=self.values.shape[:-2])
         group, knots, times = self.group, self._knots, self.times.detach()
         knots = tuple(x.detach() for x in knots)  # type: ignore[assignment]
         if self.frame == "world":
             knots = _from_world(*knots, group)  # type: ignore[assignment]
-        t = t.detach().reshape(-1) if t.ndim == 0 or len(_batch(knots[0])) == 0 else t.detach()
+        t = t.detach().reshape(-1) if t.ndim == 0 or knots[0].ndim == 2 else t.detach()
         place = locate_between(t, times, "error", True)
         u, h = (x.to(knots[0].dtype) for x in (place.u, place.duration))
         ends = _Ends(*(rows_at(x, place.segment) for x in _ends(*knots, times, group)))

@@ -17,7 +17,7 @@ from torchspline.groups.components import join, split
 from torchspline.groups.group import Group
 from torchspline.groups.operations import geodesics
 from torchspline.splines.clock import Extrapolate
-from torchspline.splines.segments import Curve, check_query, evaluate_segments, rows_at
+from torchspline.splines.segments import check_query, evaluate_segments
 from torchspline.splines.sweep import continue_signs, first, second
 from torchspline.splines.trajectory import State, Trajectory
 
@@ -137,15 +137,12 @@ def nonuniform_bspline(
         t, derivatives, extrapolate, validate, control_points, control_points=control_points.shape[:-2]
     )
     table = step_table(signs_continued(control_points, group), local_knots(knots, order), group)
-    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
-
-    def curve(common: torch.Size) -> Curve:
-        rows = table.expand(*common, *table.shape[-2:])
-        return lambda segment, u: step_fields(group, rows_at(rows, segment), u, needed, order - 1)
-
     domain = knots[order - 1 : control_points.shape[-2] + 1]
-    batch, dtype = control_points.shape[:-2], control_points.dtype
-    return evaluate_segments(curve, group, t, domain, batch, dtype, derivatives, extrapolate, validate)
+
+    def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
+        return step_fields(group, rows, u, needed, order - 1)
+
+    return evaluate_segments(table, fields, group, t, domain, derivatives, extrapolate, validate)
 
 
 def _check_knots(knots: Any, control_points: Tensor, order: int) -> None:
@@ -217,9 +214,7 @@ class NonuniformBSpline(Trajectory):
         self.control_points: Tensor
         self.knots: Tensor
         self._adopt("control_points", control_points, learnable)
-        if not isinstance(knots, nn.Parameter) and not knots.requires_grad:
-            knots = knots.to(torch.float64)
-        self._adopt("knots", knots, learnable=False)
+        self._adopt_seconds("knots", knots)
 
     @property
     def domain(self) -> tuple[float, float]:

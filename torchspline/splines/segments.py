@@ -13,8 +13,9 @@ from torchspline.groups.group import Group
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate
 from torchspline.splines.trajectory import State
 
-#: (segment, u) to value and rates by u, each (*batch, n, C); both arguments (n,) or (*batch, n), u within [0, 1].
-Curve = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
+#: From rows (*batch, n, C) of a table, u (n,) or (*batch, n) within [0, 1] and a number of derivatives to the value and
+#: so many rates by u, each (*batch, n, ...).
+Fields = Callable[[Tensor, Tensor, int], tuple[Tensor, ...]]
 
 
 class Place(NamedTuple):
@@ -142,12 +143,11 @@ def align(t: Tensor, batch: torch.Size) -> tuple[Tensor, torch.Size, tuple[int, 
 
 
 def evaluate_segments(
-    curve: Callable[[torch.Size], Curve],
+    table: Tensor,
+    fields: Fields,
     group: Group,
     t: Tensor,
     times: Tensor,
-    batch: torch.Size,
-    dtype: torch.dtype,
     derivatives: int,
     extrapolate: Extrapolate,
     validate: bool,
@@ -155,18 +155,20 @@ def evaluate_segments(
     """Value and rates per second of a curve made of segments.
 
     Args:
-        curve: makes the curve for a batch shape that its tables are to be expanded to. It returns as many rates as it
-            is built for, at least one if `extrapolate` is "linear" and else at least `derivatives`.
-        times: (M,), of the M - 1 segments. batch: of the curve's own tables.
+        table: (*batch, M - 1, C), what determines each segment. fields: the curve from that.
+        times: (M,), of the M - 1 segments.
     """
-    aligned, common, shape = align(t, batch)
+    dtype = table.dtype
+    aligned, common, shape = align(t, table.shape[:-2])
     place = locate_between(aligned, times, extrapolate, validate)
-    fields = curve(common)(place.segment, place.u.to(dtype))
+    rows = rows_at(table.expand(*common, *table.shape[-2:]), place.segment)
+    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
     duration = place.duration.to(dtype).unsqueeze(-1)
-    fields = tuple(field if r == 0 else field / duration**r for r, field in enumerate(fields))
+    by_u = fields(rows, place.u.to(dtype), needed)
+    per_second = tuple(field if r == 0 else field / duration**r for r, field in enumerate(by_u))
     if place.beyond is not None:
-        fields = past_the_end(group, fields, place.beyond.to(dtype), extrapolate)
-    return State(*(f.reshape(*shape, f.shape[-1]) for f in fields[: derivatives + 1]))
+        per_second = past_the_end(group, per_second, place.beyond.to(dtype), extrapolate)
+    return State(*(f.reshape(*shape, f.shape[-1]) for f in per_second[: derivatives + 1]))
 
 
 def past_the_end(

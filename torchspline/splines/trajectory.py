@@ -136,6 +136,12 @@ class Trajectory(nn.Module, ABC):
                 x = nn.Parameter(x)
         self._keep(name, x)
 
+    def _adopt_seconds(self, name: str, x: Tensor) -> None:
+        """Keep times as given if they carry a graph or are a `Parameter`, else a copy in float64 that is not learnt."""
+        if not isinstance(x, nn.Parameter) and not x.requires_grad:
+            x = x.to(torch.float64)
+        self._adopt(name, x, learnable=False)
+
     def _apply(self, fn: Any, recurse: bool = True) -> "Trajectory":
         """Move and convert, but times stay in the precision they have: float32 cannot tell epochs apart."""
         times: dict[str, Tensor] = {n: x for n in self._times if (x := getattr(self, n)) is not None}

@@ -1,9 +1,9 @@
 """Interpolation of keyframes by any scheme, as a function and as a trajectory."""
 
+from functools import partial
 from typing import Literal
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchspline import checks
 from torchspline.groups.components import join, split
@@ -12,7 +12,7 @@ from torchspline.splines.clock import Extrapolate
 from torchspline.splines.interpolation.registry import SCHEMES, SURVEY
 from torchspline.splines.interpolation.scheme import Scheme
 from torchspline.splines.nonuniform import signs_continued
-from torchspline.splines.segments import Curve, check_knot_times, check_query, evaluate_segments, rows_at
+from torchspline.splines.segments import check_knot_times, check_query, evaluate_segments
 from torchspline.splines.trajectory import State, Trajectory
 
 Way = Literal["short", "signs"]
@@ -59,24 +59,16 @@ def interpolate(
         State: as of `bspline`; at a key the derivatives from the right, at the last one from the left.
     Differentiable in keyframes, times and float `t`, to any order, where the curve is smooth.
     Raises:
-        TypeError: wrong type or dtype. ValueError: an unknown method or option, a wrong shape, device or
-        value, or a time
-            outside the domain.
+        TypeError: wrong type or dtype. ValueError: an unknown method or option, a wrong shape, device or value, or a
+            time outside the domain.
     """
     scheme, of, options = _resolve(method, keyframes, group, options)
     _check_keys(scheme, keyframes, times, of, way, validate)
     check_query(t, derivatives, extrapolate, validate, keyframes, keyframes=keyframes.shape[:-2])
     keys = signs_continued(keyframes, of) if way == "short" else _unit(keyframes, of)
     table = scheme.table(of, keys, times, **options)
-    needed = max(derivatives, 1) if extrapolate == "linear" else derivatives
-
-    def curve(common: torch.Size) -> Curve:
-        rows = table.expand(*common, *table.shape[-2:])
-        return lambda segment, u: scheme.fields(of, rows_at(rows, segment), u, needed)
-
-    batch, dtype = keyframes.shape[:-2], keyframes.dtype
-    ends = scheme.segments(times)
-    return evaluate_segments(curve, of, t, ends, batch, dtype, derivatives, extrapolate, validate)
+    ends, fields = scheme.segments(times), partial(scheme.fields, of)
+    return evaluate_segments(table, fields, of, t, ends, derivatives, extrapolate, validate)
 
 
 def _unit(keyframes: Tensor, group: Group) -> Tensor:
@@ -170,9 +162,7 @@ class KeyframeSpline(Trajectory):
         self.keyframes: Tensor
         self.times: Tensor
         self._adopt("keyframes", keyframes, learnable)
-        if not isinstance(times, nn.Parameter) and not times.requires_grad:
-            times = times.to(torch.float64)
-        self._adopt("times", times, learnable=False)
+        self._adopt_seconds("times", times)
 
     @property
     def domain(self) -> tuple[float, float]:
