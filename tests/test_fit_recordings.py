@@ -27,7 +27,8 @@ def longest_stretch(time_ns):
 
 @pytest.mark.realdata
 @pytest.mark.parametrize("recording", YARDSTICK)
-def test_synthesised_readings_meet_the_yardstick(shared_data, recording):
+def test_synthesised_readings_meet_the_yardstick(shared_data, recording, monkeypatch):
+    monkeypatch.setenv("TORCHSPLINE_KERNELS", "auto")  # compiled once, a tenth of the time of the reference
     poses, samples = read_poses(shared_data / recording), read_imu(shared_data / recording)
     start, stop = longest_stretch(poses.time_ns)
     window = poses.window(start, stop)
