@@ -58,6 +58,15 @@ def test_equal_to_forward_mode(group, order, side, mode):
     by_time = torch.func.jvp(of_time, (t,), (torch.ones_like(t),))[1]
     assert_allclose(jacobians.time, by_time, rtol=0, atol=1e-13 * float(1 + by_time.abs().max()))
     assert jacobians.first.shape == (2, N)
+    for fewer in range(3):
+        with ts.use_kernels(mode):
+            fields = spline.jacobians(t, derivatives=fewer, side=side)
+        assert all(x is None for x in fields[2 + fewer : 5])
+        assert_allclose(
+            fields.time, by_time[..., : fewer + 1, :], rtol=0, atol=1e-13 * float(1 + by_time.abs().max())
+        )
+        for ours, expected in zip(fields[1 : 2 + fewer], jacobians[1 : 2 + fewer], strict=True):
+            assert torch.equal(ours, expected)
     for r, ours in enumerate(jacobians[1:5]):
         assert ours.shape == (2, N, order, D, D)
         expected = torch.zeros(2, N, 9, D, D, dtype=float64)

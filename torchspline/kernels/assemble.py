@@ -180,17 +180,43 @@ def to_blocks(rows, starts, bases, chain, order, size, columns, blocks, right):
                 right[columns[run, a]] += gram[a, width - 1]
 
 
+def to_each_point(rows, base, chain, start, order, size, out):
+    """Rows (N, R, k D) of Jacobians in local coordinates to `out` (N, k, R, D), of control points.
+
+    Args:
+        chain: (M, 2, D, D) of the logarithms; start: (M, D, D), how a control point itself counts.
+    """
+    for n in range(rows.shape[0]):
+        for j in range(order):
+            own = start[base[n]] if j == 0 else chain[base[n] + j - 1, 1]
+            after = chain[base[n] + min(j, order - 2), 0]
+            for r in range(rows.shape[1]):
+                here = rows[n, r, j * size :]
+                then = rows[n, r, min(j + 1, order - 1) * size :]
+                line = out[n, j, r]
+                for c in range(size):
+                    total = 0.0
+                    for e in range(size):
+                        total += here[e] * own[e, c]
+                    if j < order - 1:
+                        for e in range(size):
+                            total += then[e] * after[e, c]
+                    line[c] = total
+
+
 _R, _I = "float64[:, :, ::1]", "int64[:, ::1]"
-_COMMON = f"{_R}, int64[::1], {_I}, float64[:, :, :, ::1], int64, int64, {_I}"
+_C = "float64[:, :, :, ::1]"
+_COMMON = f"{_R}, int64[::1], {_I}, {_C}, int64, int64, {_I}"
 _SIGNATURES = {
     "to_band": f"int64({_COMMON}, float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])",
     "to_blocks": f"void({_COMMON}, {_R}, float64[::1])",
+    "to_each_point": f"void({_R}, int64[::1], {_C}, {_R}, int64, int64, {_C})",
 }
 
 
 @cache
 def fast(loop: Callable) -> Callable:
-    """The compiled form of `to_band` or `to_blocks`."""
+    """The compiled form of one of the loops above."""
     name = loop.__name__
     helpers = [_HELPER + inspect.getsource(f) for f in (outer_products, to_points, workspace, run_gram)]
     source = _HEADER.replace("{DEPTH}", str(DEPTH)) + "\n\n".join(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchspline.arithmetic.recurrence import forward, tangent
+from torchspline.arithmetic.recurrence import MAX_DERIVATIVES, forward, tangent
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import Vector, zero
 from torchspline.groups.components import join, split
@@ -58,32 +58,38 @@ def bspline_jacobians(
     trajectories = np.arange(len(local.unit) // M).reshape(-1, 1) * M
     base = (trajectories + segment.expand(*batch, N).reshape(-1, N).numpy()).reshape(-1)
     places = u.detach().to(dtype).expand(*batch, N).reshape(-1).contiguous().numpy()
-    chain = spline.pair_jacobians(local)
-    value, *_ = (torch.from_numpy(x) for x in spline.evaluate(local, base, places, 0))
-    points = torch.from_numpy(local.unit)[torch.from_numpy(base)[:, None] + torch.arange(order)]
+    chain, value = spline.pair_jacobians(local), spline.evaluate(local, base, places, 0)[0]
+    start = np.tile(np.eye(D, dtype=spline.real), (len(local.unit), 1, 1))
+    unit_rows = np.tile(np.eye(D, dtype=spline.real), (len(base), 1, 1))
+    rows_of_value = unit_rows
+    if side == "left":
+        # Exp(delta) X = X Exp(Ad_X^-1 delta), and the other way round for the value's own tangent.
+        start = (
+            group.adjoint(group.inverse(torch.from_numpy(local.unit)), validate=False).contiguous().numpy()
+        )
+        chain = np.ascontiguousarray(chain @ np.stack([start, np.roll(start, -1, axis=0)], axis=1))
+        rows_of_value = group.adjoint(torch.from_numpy(value), validate=False).contiguous().numpy()
 
     fields: list[Tensor | None] = []
     for r in range(derivatives + 1):
         parts = tuple(part == r for part in range(r + 1))
-        unit_rows = np.tile(np.eye(D, dtype=spline.real), (len(base), 1, 1))
-        rows = spline.to_points(spline.rows(local, base, places, unit_rows, parts), chain, base)
-        jacobian = torch.from_numpy(rows).reshape(-1, D, order, D).transpose(1, 2)
-        if side == "left":
-            back = group.inverse(points, validate=False)
-            jacobian = jacobian @ group.adjoint(back, validate=False)
-            if r == 0:
-                jacobian = group.adjoint(value, validate=False).unsqueeze(1) @ jacobian
+        rows = spline.rows(local, base, places, unit_rows if r else rows_of_value, parts)
+        jacobian = torch.from_numpy(spline.to_points(rows, chain, start, base))
         fields.append(jacobian.reshape(*batch, N, order, D, D))
     time = _by_time(spline, local, base, places, derivatives)
     if side == "left":
-        time[:, 0] = group.adjoint_act(value, time[:, 0], validate=False)
+        time[:, 0] = group.adjoint_act(torch.from_numpy(value), time[:, 0], validate=False)
     fields += [None] * (4 - len(fields))
     first = segment.expand(*batch, N)
     return Jacobians(first, *fields, time.reshape(*batch, N, derivatives + 1, D))  # type: ignore[arg-type, call-arg]
 
 
 def _by_time(spline: LocalSpline, local: Local, base: np.ndarray, u: np.ndarray, derivatives: int) -> Tensor:
-    """The forward sweep of first variations with only the weights moving: it knows one derivative more."""
+    """Each derivative changes at the rate of the next; for that of the jerk, the forward sweep of first variations with
+    only the weights moving, which knows one derivative more."""
+    if derivatives < MAX_DERIVATIVES:
+        rates_of_time = spline.evaluate(local, base, u, derivatives + 1)[1:]
+        return torch.from_numpy(np.stack(rates_of_time, axis=1))
     at, logs = torch.from_numpy(base), torch.from_numpy(local.logs)
     steps: list[Vector] = [split(logs[at + j]) for j in range(spline.order - 1)]
     weights = cumulative_weights(torch.from_numpy(u), spline.order, derivatives + 1)

@@ -21,6 +21,7 @@ from torchspline.arithmetic.recurrence import difference_tangent, forward, rever
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.vector import scale, zero
 from torchspline.groups.components import join, split
+from torchspline.kernels.assemble import fast, to_each_point
 from torchspline.kernels.linearize import LinearizeKernels
 from torchspline.kernels.mode import RefusedError, usable
 from torchspline.kernels.programs import retraction
@@ -166,22 +167,26 @@ class LocalSpline:
         ]
         return torch.stack(columns, dim=1).mT.contiguous().numpy()
 
-    def to_points(self, rows: Array, chain: Array, base: Array) -> Array:
-        """From local coordinates to body tangents of the k control points: rows `(N, R, k D)` to the same shape.
+    def to_points(self, rows: Array, chain: Array, start: Array, base: Array) -> Array:
+        """From local coordinates to control points: rows `(N, R, k D)` to `(N, k, R, D)`.
 
         Args:
-            chain: of `pair_jacobians`.
+            chain: of `pair_jacobians`, (M, 2, D, D). start: (M, D, D), how each control point itself counts. Both may
+                carry whatever the columns shall be multiplied by on the right.
         """
         N, R, _ = rows.shape
         D, k = self.group.tangent_size, self.order
+        result = np.empty((N, k, R, D), self.real)
+        if self.fused and self.real is np.float64:
+            fast(to_each_point)(rows, base, chain, start, k, D, result)
+            return result
         blocks = rows[..., : k * D].reshape(N, R, k, D)
-        result = np.zeros_like(blocks)
-        result[:, :, 0] = blocks[:, :, 0]
+        result[:, 0] = blocks[:, :, 0] @ start[base]
         for j in range(1, k):
             to_first, to_second = chain[base + (j - 1)].transpose(1, 0, 2, 3)
-            result[:, :, j - 1] += blocks[:, :, j] @ to_first
-            result[:, :, j] += blocks[:, :, j] @ to_second
-        return result.reshape(N, R, k * D)
+            result[:, j - 1] += blocks[:, :, j] @ to_first
+            result[:, j] = blocks[:, :, j] @ to_second
+        return result
 
     def retract(self, control_points: Array, tangents: Array) -> Array:
         """`X_j Exp(x_j)` of points `(M, P)` and tangents `(M, D)`."""
