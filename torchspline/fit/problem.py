@@ -199,6 +199,9 @@ class Problem:
     ) -> Result:
         """Move all unknowns to where the sum of squares is least, by Levenberg-Marquardt.
 
+        The first solution with a new kind of residual, group or order compiles its loops, for seconds; later ones, also
+        in other processes, find them in the user's cache folder.
+
         Args:
             max_iterations: steps tried at most.
             cost_tolerance: stop when a step lowers the cost by less than this share.
