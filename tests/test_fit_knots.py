@@ -38,3 +38,17 @@ def test_bursts_do_not_ask_for_knots_between_them():
     fit = fit_poses(t, poses, dt="auto", progress=False)
     assert fit.trajectory.dt > 0.04
     assert max(fit.rms()) < 1e-3
+
+
+@pytest.mark.parametrize("accuracy", [(2e-5, 1e-5), (4.4e-3, 1e-5), (5.9e-3, 1e-3), (1e-4, 1e-2)])
+def test_an_accuracy_asked_for_is_kept(accuracy):
+    """Also where positions may have wider knots than rotations, by a ratio that is no whole number."""
+    t = torch.arange(1200, dtype=torch.float64) / 100
+    angle = torch.sin(3.0 * t)[:, None] * torch.tensor([[0.6, 0.2, -0.4]], dtype=torch.float64)
+    position = torch.stack([torch.cos(2.0 * t), torch.sin(2.0 * t), torch.sin(1.3 * t)], dim=-1)
+    fit = fit_poses(
+        t, torch.cat([position, SO3.exp(angle)], -1), dt="auto", accuracy=accuracy, progress=False
+    )
+    for reached, limit in zip(fit.rms(), accuracy, strict=True):
+        assert reached <= limit * 1.02
+    assert fit.trajectory.dt > 0.03

@@ -154,7 +154,9 @@ def fit_poses(
         state, _, trace = minimise(linearizer.model, linearizer.model.state(), linearizer, options, show)
         linearizer.model.store(state)
         if spacing is not None and representation == "split":
-            every = round(spacing.position / width)
+            ratio = spacing.position / width
+            # An accuracy that was asked for must not be lost by rounding up.
+            every = round(ratio) if accuracy is None else int(ratio + 1e-6)
             trajectory.control_points[:, :3] = _smoother(knots, times, measured[:, :3], every, smoothness)
     fitted = trajectory(times).detach()
     residual = torch.full((2, t.shape[0], 3), torch.nan, dtype=torch.float64)
