@@ -1,5 +1,15 @@
 """Inertial measurement units on trajectories."""
 
+from torchspline.imu.noise import flicker_noise, gauss_markov, item_generator, random_walk, white_noise
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading, measure
 
-__all__ = ["STANDARD_GRAVITY", "ImuReading", "measure"]
+__all__ = [
+    "STANDARD_GRAVITY",
+    "ImuReading",
+    "flicker_noise",
+    "gauss_markov",
+    "item_generator",
+    "measure",
+    "random_walk",
+    "white_noise",
+]
