@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import error_imu_noise
+import error_imu_strapdown
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -19,7 +20,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES]
+CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES]
 
 
 def label(case: Case) -> str:
@@ -79,6 +80,8 @@ RESULTS = {
     "State",
     "Kinematics",
     "ImuReading",
+    "Increments",
+    "Navigation",
     "PoseFit",
     "Result",
     "BatchResult",
@@ -213,7 +216,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise):
+for _more in (error_online, error_imu_noise, error_imu_strapdown):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

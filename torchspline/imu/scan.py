@@ -123,9 +123,9 @@ class _RotationProducts(Function):
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor, Tensor]:
-        """Turning step j turns all that follows as one body, so in the world the gradient of its turn is the sum of theirs.
+        """Turning one step turns all that follows as one body: in the world, the gradient of its turn is their sum.
 
-        Written with the products, which are differentiable themselves: the sum is taken along time and nothing is scanned.
+        Written with the products, which are differentiable themselves: sums along time, and nothing is scanned.
         """
         start, steps, products = ctx.saved_tensors
         q = products.unbind(-1)
