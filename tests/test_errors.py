@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
 import error_online
@@ -20,7 +21,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES]
+CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES, *error_imu_earth.CASES]
 
 
 def label(case: Case) -> str:
@@ -216,7 +217,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise, error_imu_strapdown):
+for _more in (error_online, error_imu_noise, error_imu_strapdown, error_imu_earth):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

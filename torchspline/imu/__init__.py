@@ -1,5 +1,6 @@
 """Inertial measurement units on trajectories."""
 
+from torchspline.imu import earth
 from torchspline.imu.increments import Increments, compensate, increments, sampled_increments
 from torchspline.imu.noise import flicker_noise, gauss_markov, item_generator, random_walk, white_noise
 from torchspline.imu.strapdown import Navigation, integrate_gyroscope, strapdown
@@ -11,6 +12,7 @@ __all__ = [
     "Increments",
     "Navigation",
     "compensate",
+    "earth",
     "flicker_noise",
     "gauss_markov",
     "increments",
