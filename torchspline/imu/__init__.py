@@ -1,6 +1,7 @@
 """Inertial measurement units on trajectories."""
 
 from torchspline.imu import earth
+from torchspline.imu.allan import AllanDeviation, NoiseEstimate, allan_deviation, fit_noise
 from torchspline.imu.increments import Increments, compensate, increments, sampled_increments
 from torchspline.imu.noise import flicker_noise, gauss_markov, item_generator, random_walk, white_noise
 from torchspline.imu.strapdown import Navigation, integrate_gyroscope, strapdown
@@ -8,11 +9,15 @@ from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading, measure
 
 __all__ = [
     "STANDARD_GRAVITY",
+    "AllanDeviation",
     "ImuReading",
     "Increments",
     "Navigation",
+    "NoiseEstimate",
+    "allan_deviation",
     "compensate",
     "earth",
+    "fit_noise",
     "flicker_noise",
     "gauss_markov",
     "increments",
