@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu_allan
 import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
@@ -21,7 +22,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES, *error_imu_earth.CASES]
+IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan)
+CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
 
 
 def label(case: Case) -> str:
@@ -79,7 +81,9 @@ def public() -> dict[str, Callable[..., Any]]:
 #: What the library makes and hands out; nobody is meant to call these.
 RESULTS = {
     "State",
+    "AllanDeviation",
     "Kinematics",
+    "NoiseEstimate",
     "ImuReading",
     "Increments",
     "Navigation",
@@ -217,7 +221,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise, error_imu_strapdown, error_imu_earth):
+for _more in (error_online, *IMU):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 
