@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 from torch import Tensor
 
 from torchspline import checks
@@ -55,10 +54,10 @@ class AllanDeviation(NamedTuple):
         checks.number("confidence", confidence)
         if not 0.0 < confidence < 1.0:
             raise ValueError(f"confidence: expected a probability between 0 and 1, got {confidence}")
-        degrees = self.degrees.numpy()
+        half = 0.5 * self.degrees.numpy()
         tails = 0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence
         upper, lower = (
-            self.deviation * torch.from_numpy(np.sqrt(degrees / chi2.ppf(p, degrees))) for p in tails
+            self.deviation * torch.from_numpy(np.sqrt(half / gammaincinv(half, p))) for p in tails
         )
         return lower, upper
 
@@ -79,11 +78,11 @@ class NoiseEstimate(NamedTuple):
 
 
 def allan_deviation(x: Tensor, t: Tensor, clusters: Sequence[int] | None = None) -> AllanDeviation:
-    """Overlapping Allan deviation of evenly sampled rates, [Riley 2008] (10), by cumulative sums: O(N) a cluster size.
+    """Overlapping Allan deviation of evenly sampled rates, [Riley 2008], by cumulative sums: O(N) a cluster size.
 
     Missing samples, NaN or left out, belong to no cluster: differences that would contain one are left out. Degrees of
-    freedom are those of white noise, flicker or random walk, [Riley 2008] table 5, whichever the slope of the curve is
-    nearest to.
+    freedom are those of white noise, flicker or random walk, [Riley 2008], whichever the slope of the curve is nearest
+    to.
 
     Args:
         x: record at rest, float32 or float64, (*batch, N, C); sums are taken in float64.
@@ -151,10 +150,10 @@ def fit_noise(
     """White noise, bias instability, random walk (and quantization) in an Allan deviation, with standard deviations.
 
     The variance is linear in the squares of the coefficients: `3 Q^2 / tau^2 + N^2 / tau + 2 log(2) / pi B^2 +
-    K^2 tau / 3` (IEEE Std 952, C.1; sampled random walks exactly). Non-negative generalised least squares, reweighted
-    with covariances that follow from the spectrum of the fit itself: variances of different tau share the samples, so
-    counting them as independent would promise far too much. Standard deviations hold where a coefficient is several
-    of them.
+    K^2 tau / 3` (IEEE Std 952, annex C; sampled random walks exactly). Non-negative generalised least squares, with
+    weights from covariances that follow from the spectrum of the fit itself: variances of different tau share the
+    samples, so counting them as independent would promise far too much. Standard deviations hold where a coefficient is
+    several of them.
 
     Args:
         allan: of a record. components: names of COMPONENTS.
@@ -240,6 +239,8 @@ def _fit(
     names: list[str], m: Array, dt: float, f: Array, transfer: Array, y: Array, terms: Array
 ) -> tuple[Array, Array, float]:
     """Coefficients, their standard deviations, chi-squared, of one channel."""
+    from scipy.optimize import nnls  # late: it takes longer to import than this to run
+
     design = np.stack([allan_variance(name, m, dt) for name in names], 1)
     spectra = np.stack([_spectrum(name, f, dt) for name in names], 1)
     # Covariance: 2 / duration times the integral of W_i W_j S^2; in log f, twice for both signs.
@@ -298,7 +299,7 @@ def _cluster_sizes(clusters: Sequence[int] | None, count: int) -> list[int]:
 
 
 def _degrees(variance: Tensor, terms: Tensor, m: Tensor) -> Tensor:
-    """[Riley 2008] table 5, with as many samples as the differences that were used would need without gaps."""
+    """Formulas of [Riley 2008], with as many samples as the differences that were used would need without gaps."""
     m = m[:, None]
     N = terms + 2.0 * m  # phases: one more than samples
     white = (1.5 * (N - 1) / m - 2.0 * (N - 2) / N) * (4.0 * m * m / (4.0 * m * m + 5.0))
