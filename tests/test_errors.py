@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu
 import error_imu_noise
 import error_online
 import pytest
@@ -19,7 +20,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES]
+CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu.CASES]
 
 
 def label(case: Case) -> str:
@@ -84,11 +85,13 @@ RESULTS = {
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Readings",
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "LowPass.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -213,7 +216,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise):
+for _more in (error_online, error_imu_noise, error_imu):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

@@ -1,5 +1,6 @@
 """Noise in the units people have, and the files they keep it in."""
 
+import inspect
 import math
 
 import pytest
@@ -113,6 +114,24 @@ def test_data_sheet_units():
         assert math.isclose(getattr(same, name), getattr(noise, name), rel_tol=1e-12)
     slow = ImuNoise.from_datasheet(rate_random_walk=0.5)
     assert math.isclose(slow.gyroscope_random_walk, math.radians(0.5 / 3600) / 60, rel_tol=1e-12)
+
+
+@pytest.mark.parametrize("name", inspect.signature(ImuNoise.from_datasheet).parameters)
+def test_data_sheets_that_cannot_be_right(name):
+    for bad in (None, "a", True, 1j):
+        with pytest.raises(TypeError, match=f"{name}: expected a number, got {type(bad).__name__}"):
+            ImuNoise.from_datasheet(**{name: bad})
+    for bad in (math.nan, math.inf, -1.0):
+        with pytest.raises(ValueError, match=f"{name}: expected a finite number of at least zero, got {bad}"):
+            ImuNoise.from_datasheet(**{name: bad})
+
+
+@pytest.mark.parametrize(
+    "names", [("angle_random_walk", "gyroscope_noise"), ("velocity_random_walk", "accelerometer_noise")]
+)
+def test_one_quantity_under_two_names(names):
+    with pytest.raises(ValueError, match=f"{names[0]}: got 0.1 and {names[1]}=0.2.*give one"):
+        ImuNoise.from_datasheet(**dict(zip(names, (0.1, 0.2), strict=True)))
 
 
 def test_inflation_leaves_times_alone():

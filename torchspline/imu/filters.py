@@ -88,7 +88,10 @@ def intervals(t: Tensor, count: int) -> Tensor:
             f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
         )
     if t.dtype not in (torch.float32, torch.float64, torch.int64):
-        raise TypeError(f"t: expected dtype torch.float32, torch.float64 or torch.int64, got {t.dtype}")
+        raise TypeError(
+            "t: expected seconds as torch.float32 or torch.float64, or nanoseconds as torch.int64, "
+            f"got {t.dtype}"
+        )
     if t.ndim == 0 or t.shape[-1] != count:
         raise ValueError(f"t: expected shape (N,) or (*batch, N), N = {count} times, got {tuple(t.shape)}")
     if t.dtype == torch.int64:

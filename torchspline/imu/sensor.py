@@ -21,7 +21,7 @@ from torchspline.imu.noise import (
     white_noise,
 )
 from torchspline.imu.parameters import ImuNoise
-from torchspline.imu.parts import above_zero, along_time, bias_of, common_batch, keep, tensor_of, times_of
+from torchspline.imu.parts import above_zero, along_time, bias_of, keep, tensor_of, times_of
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, excursion
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
@@ -193,6 +193,7 @@ class Imu(nn.Module):
                 checks.instance(name, low_pass, LowPass, "a torchspline.imu.LowPass")
             setattr(self, name, low_pass)
         self.sampling = Sampling(time_offset, time_skew, jitter, drop_probability)
+        checks.broadcast(**self._batches())
 
     @property
     def noise(self) -> ImuNoise | None:
@@ -225,13 +226,14 @@ class Imu(nn.Module):
         stamps = t.reshape(1) if t.ndim == 0 else t
         instants, valid = self.sampling(trajectory, stamps, generator)
         signal = self._filtered(self._exposure(trajectory, stamps, instants), instants)
+        checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
         if self.dtype is not None:
             signal = signal.to(self.dtype)
         matrix = self._matrix(signal)
         if matrix is not None:
             signal = signal @ matrix.mT
         bias, white = self._disturbances(signal, stamps, instants, generator)
-        batch = common_batch(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
+        batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
         signal = signal + bias
         if white is not None:
             signal = _plus(signal, white)
@@ -288,15 +290,23 @@ class Imu(nn.Module):
                 checks.has_last(name, given, 3, "x, y, z")
                 checks.broadcast(**{name: given.shape, "readings": x.shape})
             elif own is not None:
-                given = along_time(own, x)
+                checks.broadcast(**{name: own.shape[:-1], "readings": x.shape[:-2]})
+                given = along_time(own, x, "readings")
             parts.append(x if given is None else x - given.to(x.dtype))
-        both = torch.cat(torch.broadcast_tensors(*parts), dim=-1)
+        both = _joined(*parts)
+        checks.broadcast(readings=both.shape[:-2], **self._batches())
         matrix = self._matrix(both)
         if matrix is not None:
             both = both @ torch.linalg.inv(matrix).mT
         return ImuReading(both[..., :3], both[..., 3:])
 
     # ------------------------------------------------------------------ parts of the chain
+
+    def _batches(self) -> dict[str, torch.Size]:
+        """Batch shapes of the parameters that may have one."""
+        own = {**self._parameters, **self._buffers}
+        square = ("g_sensitivity", "accelerometer_arms")
+        return {n: x.shape[: -2 if n in square else -1] for n, x in own.items() if x is not None}
 
     def _exposure(self, trajectory: Trajectory, stamps: Tensor, instants: Tensor) -> Tensor:
         mount = self.T_body_imu
@@ -374,9 +384,8 @@ class Imu(nn.Module):
             name: density(name)
             for name in ("noise_density", "random_walk", "bias_sigma", "bias_time", "bias_instability")
         }
-        batch = common_batch(
-            signal.shape[:-2], bias.shape[:-2], *(x.shape[:-2] for x in densities.values() if x is not None)
-        )
+        known = [x.shape[:-2] for x in densities.values() if x is not None]
+        batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], *known)
         if isinstance(generator, (list, tuple)) and not batch:
             batch = torch.Size([len(generator)])
         shape = (*batch, stamps.shape[-1], 6)

@@ -169,6 +169,8 @@ def _load(path: Path) -> dict[str, Any]:
     yaml = importlib.import_module("yaml")
     try:
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: expected a file, there is none") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected a YAML file, got bytes that are no text: {error}") from None
     except IsADirectoryError:
