@@ -46,6 +46,7 @@ ACCEPTED.update(
         "Imu": (imu.Imu, {}),
         "Imu.forward": (IMU.forward, {"trajectory": SPLINE, "t": T}),
         "Imu.correct": (IMU.correct, {"readings": READINGS}),
+        "Imu.increments": (IMU.increments, {"readings": READINGS, "t": STEPS}),
         "ImuNoise": (imu.ImuNoise, {}),
         "ImuNoise.inflated": (NOISE.inflated, {"factor": 10.0}),
         "LowPass": (imu.LowPass, {"bandwidth": 10.0}),
@@ -60,6 +61,7 @@ ACCEPTED.update(
 )
 
 _NUMBERS = "ImuNoise.inflated"
+_USES = "Imu.forward Imu.increments Imu.correct LowPass.forward"
 _FILES = "read_imu_parameters write_imu_parameters"
 _PARTS = "Imu ImuNoise LowPass"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
@@ -72,12 +74,9 @@ NOT_APPLICABLE = {
     },
     "nan": {"lost samples stay as they are": "Imu.correct"},
     "zero quaternion": {
-        "no rotations that were not checked": f"{_NUMBERS} {_FILES} Imu.forward Imu.correct ImuNoise LowPass "
-        "LowPass.forward"
+        "no rotations that were not checked": f"{_NUMBERS} {_FILES} {_USES} ImuNoise LowPass"
     },
-    "count": {
-        "any number ": f"{_PARTS} {_NUMBERS} {_FILES} Imu.forward Imu.correct ImuParameters LowPass.forward"
-    },
+    "count": {"any number ": f"{_PARTS} {_NUMBERS} {_FILES} {_USES} ImuParameters"},
     "time": {"no times    ": f"{_PARTS} {_NUMBERS} {_FILES} Imu.correct ImuParameters"},
 }
 
@@ -182,40 +181,31 @@ SPLINE_ON_META = BSpline(POSE, group=SPLINE.group, dt=0.1).to("meta")
 
 
 def readings() -> Iterator[Case]:
+    for function in ("Imu.correct", "Imu.increments"):
+        for bad in (None, V, (V, V)):
+            came = f"got {type(bad).__name__}"
+            yield refused(function, "readings", "type", bad, came, "expected gyroscope and accelerometer")
+        for name in ("gyroscope", "accelerometer"):
+            for category, bad, came, expected in (
+                ("dtype", V.to(I64), "torch.int64", "torch.float32 or torch.float64"),
+                ("shape", V[..., :2], "got (2, 8, 2)", "expected shape (..., 3)"),
+            ):
+                changes = READINGS._replace(**{name: bad})
+                yield refused(function, "readings", category, changes, came, expected, name)
+        apart = READINGS._replace(accelerometer=V.to("meta"))
+        yield refused(function, "readings", "device", apart, "meta", "cpu", "accelerometer")
     function = "Imu.correct"
-    for bad in (None, V, (V, V)):
-        yield refused(
-            function,
-            "readings",
-            "type",
-            bad,
-            f"got {type(bad).__name__}",
-            "expected gyroscope and accelerometer",
-        )
-    for name in ("gyroscope", "accelerometer"):
-        for category, bad, came, expected in (
-            ("type", None, "got NoneType", "expected"),
-            ("dtype", V.to(I64), "torch.int64", "torch.float32 or torch.float64"),
-            ("shape", V[..., :2], "got (2, 8, 2)", "expected shape (..., 3)"),
-        ):
-            changes = READINGS._replace(**{name: bad})
-            named = "readings" if category == "type" else name
-            if category != "type":
-                yield refused(function, "readings", category, changes, came, expected, named)
-        given = f"{name}_bias"
-        yield refused(function, given, "type", 0.1, "got float", "expected a torch.Tensor")
-        yield refused(function, given, "dtype", THREE.to(I64), "torch.int64", "torch.float64")
-        yield refused(function, given, "shape", THREE[:2], "got (2,)", "expected shape (..., 3)")
-        yield refused(function, given, "batch", THREE.expand(5, 3), "(5, 3)", "(2, 8, 3)")
-    yield refused(
-        function,
-        "readings",
-        "device",
-        READINGS._replace(accelerometer=V.to("meta")),
-        "meta",
-        "cpu",
-        "accelerometer",
-    )
+    for name in ("gyroscope_bias", "accelerometer_bias"):
+        yield refused(function, name, "type", 0.1, "got float", "expected a torch.Tensor")
+        yield refused(function, name, "dtype", THREE.to(I64), "torch.int64", "torch.float64")
+        yield refused(function, name, "shape", THREE[:2], "got (2,)", "expected shape (..., 3)")
+        yield refused(function, name, "batch", THREE.expand(5, 3), "(5, 3)", "(2, 8, 3)")
+    function = "Imu.increments"
+    broken = READINGS._replace(gyroscope=changed(V, (0, 0, 0), NAN))
+    yield refused(function, "readings", "nan", broken, "got nan at index (0, 0, 0)", "finite", "gyroscope")
+    yield refused(function, "t", "type", 0.1, "got float", "expected a torch.Tensor")
+    yield refused(function, "t", "shape", STEPS[:3], "got (3,)", "a time for each sample")
+    yield refused(function, "t", "time", STEPS.flip(0), "got 7.0 and then 6.0", "expected increasing times")
 
 
 def noise() -> Iterator[Case]:
@@ -245,11 +235,11 @@ def filters() -> Iterator[Case]:
     yield from (c for c in tensor(function, "x", " (*batch, N, C)") if c.category in ("type", "dtype"))
     yield refused(function, "x", "shape", STEPS, "got (8,)", "expected shape (*batch, N, C)")
     yield refused(function, "t", "type", 0.1, "got float", "expected a torch.Tensor")
-    yield refused(function, "t", "dtype", STEPS.to(torch.int32), "torch.int32", "nanoseconds as torch.int64")
-    yield refused(function, "t", "shape", STEPS[:3], "got (3,)", "N = 8 times")
+    yield refused(function, "t", "dtype", STEPS.to(torch.int32), "torch.int32", "or torch.int64")
+    yield refused(function, "t", "shape", STEPS[:3], "got (3,)", "a time for each sample")
     yield refused(function, "t", "batch", STEPS.expand(3, 8), "(3,)", "(2,)")
     yield refused(function, "t", "nan", changed(STEPS, 1, NAN), "got nan at index (1,)", "expected finite")
-    yield refused(function, "t", "time", STEPS.flip(0), "got 7.0", "expected increasing times")
+    yield refused(function, "t", "time", STEPS.flip(0), "got 7.0 and then 6.0", "expected increasing times")
 
 
 def files() -> Iterator[Case]:

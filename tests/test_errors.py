@@ -8,6 +8,7 @@ from typing import Any
 
 import error_imu
 import error_imu_noise
+import error_imu_strapdown
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -20,7 +21,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu.CASES]
+CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES, *error_imu.CASES]
 
 
 def label(case: Case) -> str:
@@ -80,6 +81,8 @@ RESULTS = {
     "State",
     "Kinematics",
     "ImuReading",
+    "Increments",
+    "Navigation",
     "PoseFit",
     "Result",
     "BatchResult",
@@ -216,7 +219,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise, error_imu):
+for _more in (error_online, error_imu_noise, error_imu_strapdown, error_imu):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 
