@@ -31,8 +31,11 @@ from torchspline import SO3, BSpline, imu
 THREE = torch.ones(3, dtype=F64)
 NOISE = imu.ImuNoise(0.1, 0.1)
 IMU = imu.Imu(noise=NOISE, rate=100.0)
+MAGNETOMETER = imu.Magnetometer((20.0, 0.0, -40.0), noise_density=1.0, rate=100.0)
+BAROMETER = imu.Barometer(noise_density=1.0, rate=100.0)
 FILTER = imu.LowPass(10.0)
 STEPS = torch.arange(8, dtype=F64)
+SPLINE_ON_META = BSpline(POSE, group=SPLINE.group, dt=0.1).to("meta")
 READINGS = imu.ImuReading(V, V)
 YAML = file(
     "gyroscope_noise_density: 0.1\ngyroscope_random_walk: 0.1\naccelerometer_noise_density: 0.1\n"
@@ -47,6 +50,10 @@ ACCEPTED.update(
         "Imu.forward": (IMU.forward, {"trajectory": SPLINE, "t": T}),
         "Imu.correct": (IMU.correct, {"readings": READINGS}),
         "Imu.increments": (IMU.increments, {"readings": READINGS, "t": STEPS}),
+        "Magnetometer": (imu.Magnetometer, {"field": (20.0, 0.0, -40.0)}),
+        "Magnetometer.forward": (MAGNETOMETER.forward, {"trajectory": SPLINE, "t": T}),
+        "Barometer": (imu.Barometer, {}),
+        "Barometer.forward": (BAROMETER.forward, {"trajectory": SPLINE, "t": T}),
         "ImuNoise": (imu.ImuNoise, {}),
         "ImuNoise.inflated": (NOISE.inflated, {"factor": 10.0}),
         "LowPass": (imu.LowPass, {"bandwidth": 10.0}),
@@ -61,9 +68,9 @@ ACCEPTED.update(
 )
 
 _NUMBERS = "ImuNoise.inflated"
-_USES = "Imu.forward Imu.increments Imu.correct LowPass.forward"
+_USES = "Imu.forward Imu.increments Imu.correct Magnetometer.forward Barometer.forward LowPass.forward"
 _FILES = "read_imu_parameters write_imu_parameters"
-_PARTS = "Imu ImuNoise LowPass"
+_PARTS = "Imu Magnetometer Barometer ImuNoise LowPass"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {"plain numbers or files": f"{_NUMBERS} {_FILES}"},
@@ -74,10 +81,10 @@ NOT_APPLICABLE = {
     },
     "nan": {"lost samples stay as they are": "Imu.correct"},
     "zero quaternion": {
-        "no rotations that were not checked": f"{_NUMBERS} {_FILES} {_USES} ImuNoise LowPass"
+        "no rotations that were not checked": f"{_NUMBERS} {_FILES} {_USES} ImuNoise LowPass Barometer"
     },
-    "count": {"any number ": f"{_PARTS} {_NUMBERS} {_FILES} {_USES} ImuParameters"},
-    "time": {"no times    ": f"{_PARTS} {_NUMBERS} {_FILES} Imu.correct ImuParameters"},
+    "count": {"any number of samples of a sensor": f"{_PARTS} {_NUMBERS} {_FILES} {_USES} ImuParameters"},
+    "time": {"no times in parts of a sensor": f"{_PARTS} {_NUMBERS} {_FILES} Imu.correct ImuParameters"},
 }
 
 
@@ -109,6 +116,7 @@ def parameter(
 
 def cases() -> Iterator[Case]:
     yield from sensor()
+    yield from ambient()
     yield from readings()
     yield from noise()
     yield from filters()
@@ -163,21 +171,53 @@ def sensor() -> Iterator[Case]:
         function, "gravity", "batch", THREE.expand(2, 3), "(2,)", "(4,)", earth_rate=THREE.expand(4, 3)
     )
 
+    for function in ("Imu.forward", "Magnetometer.forward", "Barometer.forward"):
+        yield from times(function)
+        yield refused(function, "trajectory", "type", POSE, "got Tensor", "expected a Trajectory")
+        yield refused(function, "trajectory", "device", SPLINE_ON_META, "meta", "cpu", t=T.to("meta"))
+        for bad in (5, "a"):
+            yield refused(function, "generator", "type", bad, f"got {type(bad).__name__}", "torch.Generator")
+        three = [torch.Generator() for _ in range(3)]
+        yield refused(function, "generator", "option", three, "got 3", "one for each row")
     function = "Imu.forward"
-    yield from times(function)
-    yield refused(function, "trajectory", "type", POSE, "got Tensor", "expected a Trajectory")
     turning = BSpline(POSE[..., 3:], group=SO3, dt=0.1)
     yield refused(
         function, "trajectory", "option", turning, "got SO3", "expected one with rotation and position"
     )
-    yield refused(function, "trajectory", "device", SPLINE_ON_META, "meta", "cpu", t=T.to("meta"))
-    for bad in (5, "a"):
-        yield refused(function, "generator", "type", bad, f"got {type(bad).__name__}", "torch.Generator")
-    three = [torch.Generator() for _ in range(3)]
-    yield refused(function, "generator", "option", three, "got 3", "one for each row")
 
 
-SPLINE_ON_META = BSpline(POSE, group=SPLINE.group, dt=0.1).to("meta")
+def ambient() -> Iterator[Case]:
+    function = "Magnetometer"
+    yield from parameter(function, "field", 3)
+    yield refused(function, "field", "type", None, "got None", "expected a tensor or three numbers")
+    yield from parameter(function, "bias", 3)
+    yield from parameter(function, "soft_iron", 3, 3)
+    yield from parameter(function, "rotation", 4)
+    none = torch.zeros(4, dtype=F64)
+    yield refused(function, "rotation", "zero quaternion", none, "got length 0", "expected quaternions")
+    for name in ("noise_density", "random_walk"):
+        yield from parameter(function, name, 3, least=True)
+        yield from parameter("Barometer", name, least=True)
+    for name in ("range", "resolution"):
+        yield from parameter(function, name, 3, above=True)
+        yield from parameter("Barometer", name, above=True)
+    function = "Barometer"
+    for name in ("bias", "ground_height"):
+        yield from parameter(function, name)
+    for name in ("up", "lever_arm"):
+        yield from parameter(function, name, 3)
+    for name in ("up", "ground_height"):
+        yield refused(function, name, "type", None, "got None", "expected a tensor or numbers")
+    yield refused(function, "up", "option", THREE, "got length 1.7", "length one")
+    for function in ("Magnetometer", "Barometer"):
+        for name in ("time_offset", "time_skew"):
+            yield from parameter(function, name)
+        for name in ("jitter", "drop_probability"):
+            yield from parameter(function, name, least=True)
+        yield refused(function, "low_pass", "type", 5.0, "got float", "expected a torchspline.imu.LowPass")
+        yield from (c for c in numbers(function, "rate", 0.0, -1.0) if c.changes["rate"] is not None)
+        for bad in (torch.float16, torch.int64, "float32"):
+            yield refused(function, "dtype", "dtype", bad, f"got {bad}", "torch.float32 or torch.float64")
 
 
 def readings() -> Iterator[Case]:

@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import error_imu
+import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
 import error_online
@@ -21,7 +22,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES, *error_imu_strapdown.CASES, *error_imu.CASES]
+MORE = (error_online, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown)
+CASES = [case for more in MORE for case in more.CASES]
 
 
 def label(case: Case) -> str:
@@ -89,6 +91,7 @@ RESULTS = {
     "Alignment",
     "Differentials",
     "Readings",
+    "AmbientReadings",
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
@@ -219,7 +222,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise, error_imu_strapdown, error_imu):
+for _more in MORE:
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

@@ -90,3 +90,14 @@ def times_of(t: Tensor, trajectory: Trajectory) -> Tensor:
     if t.dtype != torch.int64:
         checks.finite("t", t)
     return t
+
+
+def mean_rate(t: Tensor) -> float:
+    """Samples per second of a sensor that took its samples at `t`, (..., N)."""
+    if t.shape[-1] < 2:
+        raise ValueError("rate: expected samples per second where there is a single stamp, got None")
+    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64).mean().item()
+    seconds = span * 1e-9 if t.dtype == torch.int64 else span
+    if not seconds > 0:
+        raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
+    return (t.shape[-1] - 1) / seconds

@@ -23,7 +23,7 @@ from torchspline.imu.noise import (
     white_noise,
 )
 from torchspline.imu.parameters import ImuNoise
-from torchspline.imu.parts import above_zero, along_time, bias_of, keep, tensor_of, times_of
+from torchspline.imu.parts import above_zero, along_time, bias_of, keep, mean_rate, tensor_of, times_of
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, excursion
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
@@ -439,15 +439,7 @@ class Imu(nn.Module):
         return _joined(*(like.new_full((3,), missing) if x is None else along_time(x, like) for x in both))
 
     def _rate(self, at: Tensor) -> float:
-        if self.rate is not None:
-            return self.rate
-        if at.shape[-1] < 2:
-            raise ValueError("rate: expected samples per second where there is a single stamp, got None")
-        span = (at[..., -1] - at[..., 0]).detach().to(torch.float64).mean().item()
-        seconds = span * 1e-9 if at.dtype == torch.int64 else span
-        if not seconds > 0:
-            raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
-        return (at.shape[-1] - 1) / seconds
+        return mean_rate(at) if self.rate is None else self.rate
 
 
 def _check_readings(readings: Any) -> None:
