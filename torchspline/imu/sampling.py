@@ -99,7 +99,7 @@ class Sampling(nn.Module):
         if isinstance(generator, (list, tuple)) and not batch:
             batch = torch.Size([len(generator)])
         # Two columns whatever is used, so that one effect does not change the random numbers of another.
-        normals = white_noise((*batch, t.shape[-1], 2), 1.0, 1.0, generator, torch.float64).to(t.device)
+        normals = white_noise((*batch, t.shape[-1], 2), 1.0, 1.0, generator, torch.float32).to(t.device)
         if self.jitter is not None:
             at = excursion(trajectory, at, normals[..., 0] * _column(self.jitter))
         if self.drop_probability is not None:

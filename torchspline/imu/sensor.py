@@ -236,7 +236,7 @@ class Imu(nn.Module):
             signal = signal @ matrix.mT
         bias, white = self._disturbances(signal, at, instants, generator)
         batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
-        signal = signal + bias
+        signal = _plus(signal, bias)
         if white is not None:
             signal = _plus(signal, white)
         signal = self._converted(signal)
