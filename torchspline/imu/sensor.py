@@ -224,7 +224,8 @@ class Imu(nn.Module):
                 item is the same in whichever batch it is drawn: `[item_generator(seed, i) for i in items]`.
         Returns:
             Readings: in `dtype`, on the trajectory's device.
-        Differentiable in the trajectory, float `t` and all parameters but rate and resolution.
+        Differentiable in the trajectory, float `t` and all parameters but rate and resolution. Where no gradient is
+        wanted of the motion and of where the IMU sits (`learnable=False`, or `torch.no_grad()`), it is far faster.
         Raises:
             TypeError, ValueError: a wrong type, shape or value, times outside the domain, or a trajectory without
                 rotation or position.
