@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu
 import error_imu_allan
 import error_imu_earth
 import error_imu_noise
@@ -22,8 +23,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan)
-CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
+MORE = (error_online, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown, error_imu_allan)
+CASES = [case for more in MORE for case in more.CASES]
 
 
 def label(case: Case) -> str:
@@ -92,11 +93,14 @@ RESULTS = {
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Readings",
+    "AmbientReadings",
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "LowPass.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -221,7 +225,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, *IMU):
+for _more in MORE:
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 
