@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from common import Table, run, save, show
+from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
 from recordings.load import SECOND, Recording, load, longest_stretch
 from scipy.signal import welch
@@ -196,7 +196,7 @@ def experiment(
         spacing: knots of the fitted motion, ms.
         seed: of the simulated noise.
     """
-    folder = Path(__file__).resolve().parent.parent / data
+    folder = ROOT / data
     found, rows, figures = {}, [], {}
     for i, name in enumerate([*rest, *moving]):
         recording = load(folder, name, seed)
