@@ -143,9 +143,9 @@ def residual(
 
 
 def spectrum(t: Tensor, x: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Square root of the two-sided density, which is the density of white noise; pieces of two seconds or a quarter."""
+    """Square root of the two-sided density, which is the density of white noise; pieces of a second or a quarter of the record."""
     rate = (len(t) - 1) / (t[-1] - t[0]).item()
-    f, power = welch(x.numpy(), rate, nperseg=min(len(t) // 4, round(2 * rate)), axis=0)
+    f, power = welch(x.numpy(), rate, nperseg=min(len(t) // 4, round(rate)), axis=0)
     return f[1:], np.sqrt(0.5 * power[1:])
 
 
