@@ -143,7 +143,7 @@ def residual(
 
 
 def spectrum(t: Tensor, x: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Square root of the two-sided density, which is the density of white noise; pieces of a second or a quarter of all."""
+    """Square root of the two-sided density, the density of white noise; pieces of a second or a quarter of all."""
     rate = (len(t) - 1) / (t[-1] - t[0]).item()
     f, power = welch(x.numpy(), rate, nperseg=min(len(t) // 4, round(rate)), axis=0)
     return f[1:], np.sqrt(0.5 * power[1:])

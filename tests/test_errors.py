@@ -23,8 +23,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-MORE = (error_online, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown, error_imu_allan)
-CASES = [case for more in MORE for case in more.CASES]
+IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
+CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
 
 
 def label(case: Case) -> str:
@@ -225,7 +225,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in MORE:
+for _more in (error_online, *IMU):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 
