@@ -11,6 +11,7 @@ import error_imu_allan
 import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
+import error_interop
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -23,7 +24,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
+IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu, error_interop)
 CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
 
 

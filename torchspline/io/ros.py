@@ -26,6 +26,13 @@ _POSES = {
     "geometry_msgs/msg/TransformStamped": "transform",
     "nav_msgs/msg/Odometry": "pose.pose",
 }
+#: What messages are made of.
+_MADE_OF = (
+    "builtin_interfaces/msg/Time",
+    "std_msgs/msg/Header",
+    "sensor_msgs/msg/Imu",
+    *(f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "Pose", "Point", "Quaternion", "Vector3")),
+)
 #: Who the poses of a bag that is written belong to, and its IMUs.
 _WORLD, _SENSOR = "world", "imu"
 
@@ -82,7 +89,7 @@ def write_rosbag(path: str | PathLike[str], records: Mapping[str, PoseRecord | I
     check_folder(path)
     rosbag2, typesys = _library("rosbag2"), _library("typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    make = {name.split("/")[-1]: store.types[name] for name in store.types}
+    make = {name.split("/")[-1]: store.types[name] for name in _MADE_OF}
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     with writer:
         for topic, record in records.items():
