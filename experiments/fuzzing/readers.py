@@ -1,0 +1,145 @@
+"""Every reader of the library, with valid files to damage."""
+
+import gzip
+import tempfile
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from fuzzing.watch import Sample
+
+import torchspline as ts
+from torchspline import io
+
+_STAMP, _STEP = 1_520_530_308_189_679_351, 5_000_000
+_ROWS = 12
+
+
+class Reader(NamedTuple):
+    read: Callable[[Path], Any]
+    samples: list[Sample]
+
+
+def readers(seed: int) -> dict[str, Reader]:
+    """By name. Those of ROS bags only where the package rosbags is installed."""
+    generator = torch.Generator().manual_seed(seed)
+    poses = ts.SE3.random(_ROWS, generator=generator)
+    record = io.PoseRecord(
+        _STAMP + _STEP * torch.arange(_ROWS), poses[:, :3].contiguous(), poses[:, 3:].contiguous()
+    )
+    imu = io.ImuRecord(record.time_ns, record.position, record.position.flip(0).contiguous())
+    with tempfile.TemporaryDirectory() as folder:
+        return _readers(Path(folder), record, imu)
+
+
+def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, Reader]:
+    def written(name: str, write: Callable[..., Any], *arguments: Any) -> Sample:
+        write(folder / name, *arguments)
+        return Sample(name, (folder / name).read_bytes())
+
+    def packed(sample: Sample) -> Sample:
+        return Sample(f"{sample.name}.gz", gzip.compress(sample.content, mtime=0), sample.beside)
+
+    tum = written("tum.txt", io.write_poses, record, "tum")
+    euroc = written("poses.csv", io.write_poses, record, "euroc")
+    samples = written("imu.csv", io.write_imu, imu)
+    rows = torch.cat([ts.SO3.to_matrix(record.rotation), record.position[..., None]], -1).reshape(-1, 12)
+    kitti = "\n".join(" ".join(f"{x:.12e}" for x in row) for row in rows.tolist()).encode()
+    stamps = "\n".join(f"{0.1 * i:e}" for i in range(len(record))).encode()
+    parameters = io.ImuParameters(ts.imu.ImuNoise(1.7e-4, 1.9e-5, 2e-3, 3e-3), 200.0)
+    found = {
+        "read_poses, TUM": Reader(io.read_poses, [tum, packed(tum)]),
+        "read_poses, EuRoC": Reader(io.read_poses, [euroc, packed(euroc)]),
+        "read_imu, EuRoC": Reader(io.read_imu, [samples, packed(samples)]),
+        "read_poses, KITTI": Reader(
+            io.read_poses, [Sample("00_gt.txt", kitti, (("00_times.txt", stamps),))]
+        ),
+        "read_poses, KITTI stamps": Reader(_kitti_stamps, [Sample("stamps.txt", stamps, (("gt.txt", kitti),))]),
+        "read_imu_parameters": Reader(
+            io.read_imu_parameters,
+            [
+                written(f"{form}.yaml", io.write_imu_parameters, parameters, form)
+                for form in ("kalibr", "euroc")
+            ]
+            + [Sample("imu-result.yaml", _KALIBR)],
+        ),
+        "load_trajectory": Reader(io.load_trajectory, _trajectories(written)),
+        "read_nerfstudio": Reader(
+            lambda path: io.read_nerfstudio(path, fps=None),
+            [written(f"{kind}.json", io.write_nerfstudio, record, kind) for kind in ("camera_path", "transforms")],
+        ),
+    }
+    return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
+
+
+def _kitti_stamps(path: Path) -> Any:
+    return io.read_poses(path.with_name("gt.txt"), "kitti", times=path)
+
+
+def _trajectories(written: Callable[..., Sample]) -> list[Sample]:
+    points = ts.SE3.random(6, generator=torch.Generator().manual_seed(0))
+    rates = torch.ones(2, 6, 6, dtype=torch.float64)
+    times = torch.arange(6.0, dtype=torch.float64)
+    families = {
+        "uniform": ts.BSpline(points, group=ts.SE3, dt=0.1),
+        "mounted": ts.SplitBSpline(points, dt_ns=10**8, t0_ns=_STAMP).mounted(points[0]),
+        "hermite": ts.HermiteSpline(points, *rates, group=ts.SE3, times=times),
+        "keyframes": ts.KeyframeSpline("SPLIT", points, times),
+        "knots": ts.NonuniformBSpline(points, group=ts.SE3, order=3, knots=torch.arange(9.0, dtype=torch.float64)),
+    }
+    return [written(f"{name}.npz", io.save_trajectory, x) for name, x in families.items()]
+
+
+def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, Reader]:
+    from rosbags import rosbag1, rosbag2, typesys
+
+    io.write_rosbag(folder / "both", {"/pose": record, "/imu": imu})
+    mcap = Sample("both.mcap", (folder / "both" / "both.mcap").read_bytes())
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    old = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    kind = "geometry_msgs/msg/PoseStamped"
+    with rosbag2.Reader(folder / "both") as reader:
+        raw = [(t, x) for c, t, x in reader.messages() if c.msgtype == kind]
+    with rosbag2.Writer(folder / "sqlite", version=8) as writer:
+        connection = writer.add_connection("/pose", kind, typestore=store)
+        for t, x in raw:
+            writer.write(connection, t, x)
+    with rosbag1.Writer(folder / "old.bag") as writer:
+        connection = writer.add_connection("/pose", kind, typestore=old)
+        for t, x in raw:
+            writer.write(connection, t, store.cdr_to_ros1(x, kind))
+    (database,) = (folder / "sqlite").glob("*.db3")
+    return {
+        "read_poses, ROS 2 MCAP": Reader(io.read_poses, [mcap]),
+        "read_imu, ROS 2 MCAP": Reader(io.read_imu, [mcap]),
+        "read_poses, ROS 2 SQLite": Reader(io.read_poses, [Sample("x.db3", database.read_bytes())]),
+        "read_poses, ROS 1": Reader(io.read_poses, [Sample("old.bag", (folder / "old.bag").read_bytes())]),
+    }
+
+
+_KALIBR = b"""imu0:
+  T_i_b:
+  - [1.0, 0.0, 0.0, 0.0]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  accelerometer_noise_density: 0.006
+  accelerometer_random_walk: 0.0002
+  accelerometers:
+    M:
+    - [1.01, 0.0, 0.0]
+    - [0.001, 0.99, 0.0]
+    - [0.002, -0.003, 1.0]
+  gyroscope_noise_density: 0.0004
+  gyroscope_random_walk: 4.0e-06
+  gyroscopes:
+    A: [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    C_gyro_i: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    M: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+  model: scale-misalignment
+  rostopic: /imu0
+  time_offset: 0.0
+  update_rate: 200.0
+"""
