@@ -6,7 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-import error_online
+import error_splines
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
@@ -18,7 +18,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = error_online.CASES
+CASES = error_splines.CASES
 
 
 def label(case: Case) -> str:
@@ -212,7 +212,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _category, _reasons in error_online.NOT_APPLICABLE.items():
+for _category, _reasons in error_splines.NOT_APPLICABLE.items():
     NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.

@@ -29,6 +29,7 @@ from torchspline.splines.clock import Extrapolate
 from torchspline.splines.segments import (
     check_knot_times,
     check_query,
+    durations,
     evaluate_segments,
     locate_between,
     rows_at,
@@ -89,7 +90,7 @@ def _ends(values: Tensor, velocities: Tensor, accelerations: Tensor, times: Tens
     unit = algebra.normalize(split(values))
     between = algebra.between(first(unit), second(unit))
     points = join(continue_signs(algebra, unit, between), values)
-    h = times.to(torch.float64).diff().to(values.dtype).unsqueeze(-1)
+    h = durations(times).to(values.dtype).unsqueeze(-1)
     pairs = []
     for x, factor in ((points, None), (velocities, h), (accelerations, h * h)):
         for side in (x[..., :-1, :], x[..., 1:, :]):
@@ -158,9 +159,9 @@ def hermite(
         values: `(*batch, M, P)` points of `group` at the knots, M >= 2; quaternions of any length and sign,
             neighbours are joined the short way round.
         velocities, accelerations: `(*batch, M, D)` at the knots, per second and per second squared.
-        t: `()`, `(N,)` or `(*batch, N)` seconds within the knots; float32 only while its rounding stays below a
-            thousandth of the shortest segment.
-        times: `(M,)` seconds of the knots, increasing, uniform or not.
+        t: `()`, `(N,)` or `(*batch, N)` within the knots: int64 nanoseconds if their times are, else seconds, float32
+            only while its rounding stays below a thousandth of the shortest segment.
+        times: `(M,)` seconds or int64 nanoseconds of the knots, increasing, uniform or not.
         coordinates: "product", the product of geodesics of [E17] (59), third order; "logarithm", one quintic in the
             logarithm, sixth order. See the module.
         frame: of velocities and accelerations at the knots, and of the product: "body" or, as in [E17], "world".
@@ -174,7 +175,7 @@ def hermite(
     """
     checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
     _check_knots(values, velocities, accelerations, times, group, coordinates, frame, validate)
-    check_query(t, derivatives, extrapolate, validate, values, values=values.shape[:-2])
+    check_query(t, times, derivatives, extrapolate, validate, values, values=values.shape[:-2])
     knots = (values, velocities, accelerations)
     state = _evaluate(knots, t, group, times, coordinates, frame, derivatives, extrapolate, validate)
     return to_body_frame(state, group) if frame == "world" else state
@@ -257,7 +258,7 @@ class HermiteSpline(Trajectory):
             require grad and Parameters are used as given, others copied into Parameters, or buffers if not
             `learnable`.
         group, coordinates, frame, extrapolate, validate: as in `hermite`.
-        times: `(M,)` seconds, kept in float64; a tensor that requires grad is used as given.
+        times: `(M,)` seconds, kept in float64, or int64 nanoseconds; a tensor that requires grad is used as given.
         learnable: whether tensors that do not require grad become Parameters; never the times.
     """
 
@@ -293,8 +294,8 @@ class HermiteSpline(Trajectory):
         self._adopt_seconds("times", times)
 
     @property
-    def domain(self) -> tuple[float, float]:
-        """First and last knot, seconds."""
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last knot: seconds, or nanoseconds where their times are int64."""
         return self.times[0].item(), self.times[-1].item()
 
     def evaluate(self, t: Tensor, derivatives: int = 2, frame: Frame = "body") -> State:
@@ -302,7 +303,13 @@ class HermiteSpline(Trajectory):
         (`dX/dt X^-1` and its derivatives, as in [E17] (33), (36))."""
         checks.choice("frame", frame, ("body", "world"))
         check_query(
-            t, derivatives, self.extrapolate, self.validate, self.values, values=self.values.shape[:-2]
+            t,
+            self.times,
+            derivatives,
+            self.extrapolate,
+            self.validate,
+            self.values,
+            values=self.values.shape[:-2],
         )
         state = _evaluate(
             self._knots, t, self.group, self.times, self.coordinates, self.frame, derivatives, self.extrapolate,
@@ -321,14 +328,14 @@ class HermiteSpline(Trajectory):
         (95), (96), which say C for B. O(1) per query, no graph.
 
         Args:
-            t: `(N,)` or `(*batch, N)` seconds inside the domain.
+            t: `(N,)` or `(*batch, N)` inside the domain, in the unit of the knots.
             side: of perturbations of values, at the knots and of the result: `X <- Exp(delta) X` ("left") or
                 `X Exp(delta)`. Rates, of knots and results, are those in the spline's own `frame`.
         Raises:
             ValueError: a time outside the domain.
         """
         checks.choice("side", side, ("left", "right"))
-        check_query(t, 2, "error", True, self.values, values=self.values.shape[:-2])
+        check_query(t, self.times, 2, "error", True, self.values, values=self.values.shape[:-2])
         group, knots, times = self.group, self._knots, self.times.detach()
         knots = tuple(x.detach() for x in knots)  # type: ignore[assignment]
         if self.frame == "world":
