@@ -83,6 +83,7 @@ RESULTS = {
     "BatchResult",
     "Alignment",
     "Differentials",
+    *error_splines.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
