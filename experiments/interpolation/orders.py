@@ -81,7 +81,7 @@ def order(name: str, seed: int) -> float | None:
     return math.log2(errors[0] / errors[1])
 
 
-def family_order(name: str, seed: int, pieces: tuple[int, int] = (16, 32)) -> float:
+def family_order(name: str, seed: int, pieces: tuple[int, int] = (24, 48)) -> float:
     """The same for a family through `approximate`, from the largest distances in position and rotation."""
     family, group, options = FAMILIES[name]
     errors = []

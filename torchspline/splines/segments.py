@@ -113,9 +113,8 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     if nanoseconds:
         duration = duration * NANOSECOND
     # A few rounding errors beyond the ends belong to the domain.
-    rounding = 8.0 * torch.finfo(torch.float32 if t.dtype == torch.float32 else torch.float64).eps
     ends = knots.detach()
-    slack = 0 if nanoseconds else rounding * (ends.abs().amax() + ends[-1] - ends[0])
+    slack = 0 if nanoseconds else _rounding(t.dtype) * (ends.abs().amax() + ends[-1] - ends[0])
     outside = ~((s.detach() >= ends[0] - slack) & (s.detach() <= ends[-1] + slack))
     if extrapolate != "error":
         inside = torch.where(outside, u.clamp(0.0, 1.0), u)
@@ -123,6 +122,17 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     if validate and not _refuse(outside, t, knots):
         u = torch.where(outside, torch.nan, u)
     return Place(segment, u, duration, None)
+
+
+def _rounding(dtype: torch.dtype) -> float:
+    return 8.0 * torch.finfo(torch.float32 if dtype == torch.float32 else torch.float64).eps
+
+
+def bounds(knots: Any) -> tuple[float, float]:
+    """First and last time that belong to knots (an array of float64), a few rounding errors beyond the ends."""
+    start, end = float(knots[0]), float(knots[-1])
+    slack = _rounding(torch.float64) * (max(abs(start), abs(end)) + end - start)
+    return start - slack, end + slack
 
 
 def _check_rounding(t: Tensor, steps: Tensor) -> None:
