@@ -10,7 +10,7 @@ from torchspline.groups.components import join, split
 from torchspline.groups.group import Group
 from torchspline.splines.clock import Extrapolate
 from torchspline.splines.interpolation.registry import SCHEMES, SURVEY
-from torchspline.splines.interpolation.scheme import CurveScheme, Scheme
+from torchspline.splines.interpolation.scheme import Scheme
 from torchspline.splines.nonuniform import signs_continued
 from torchspline.splines.segments import check_knot_times, check_query, evaluate_segments
 from torchspline.splines.trajectory import State, Trajectory
@@ -68,10 +68,9 @@ def interpolate(
     keys = signs_continued(keyframes, of) if way == "short" else _unit(keyframes, of)
     table = scheme.table(of, keys, times, **options)
     ends, fields = scheme.segments(times), partial(scheme.fields, of)
-    if isinstance(scheme, CurveScheme):
-        found = scheme.evaluate(of, table, t, ends, derivatives)
-        if found is not None:
-            return State(*found)
+    found = scheme.evaluate(of, table, t, ends, derivatives)
+    if found is not None:
+        return State(*found)
     return evaluate_segments(table, fields, of, t, ends, derivatives, extrapolate, validate)
 
 

@@ -66,6 +66,30 @@ class Scheme(ABC):
     def fields(self, group: Group, rows: Tensor, u: Tensor, derivatives: int) -> tuple[Tensor, ...]:
         """Value and rates by u, in [0, 1], from rows (*batch, n, C) of the table and u (n,) or (*batch, n)."""
 
+    @abstractmethod
+    def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+        """The same on components."""
+
+    def evaluate(
+        self, group: Group, table: Tensor, t: Tensor, times: Tensor, derivatives: int
+    ) -> list[Tensor] | None:
+        """Value and rates per second of one curve at many times (N,), by one compiled loop that also finds where they
+        fall; None where there is none for this call, or a time lies outside."""
+        given = (table, t, times)
+        if table.ndim != 2 or t.ndim != 1 or t.dtype != torch.float64 or times.dtype == torch.int64:
+            return None
+        if t.numel() < FUSED_ROWS or torch.compiler.is_compiling() or not usable(*given):
+            return None
+        if torch.is_grad_enabled() and any(x.requires_grad for x in given):
+            return None
+        kernel = located_kernel(self, group.name, table.shape[-1], derivatives, table.dtype)
+        if kernel is None:
+            return None
+        knots = flat(times.to(torch.float64))
+        outputs = [table.new_empty(t.shape[0], size) for size in kernel.results]
+        outside = kernel(flat(table), knots, flat(t), bounds(knots), [flat(x) for x in outputs])
+        return None if outside else outputs
+
 
 class CurveScheme(Scheme):
     """A scheme that is written as group operations; power series for u give its rates."""
@@ -93,30 +117,10 @@ class CurveScheme(Scheme):
         fields = self.components(group.arithmetic, split(rows), u, derivatives)
         return tuple(join(x, rows) for x in fields)
 
-    def evaluate(
-        self, group: Group, table: Tensor, t: Tensor, times: Tensor, derivatives: int
-    ) -> list[Tensor] | None:
-        """Value and rates per second of one curve at many times (N,), by one compiled loop that also finds where they
-        fall; None where there is none for this call, or a time lies outside."""
-        given = (table, t, times)
-        if table.ndim != 2 or t.ndim != 1 or t.dtype != torch.float64 or times.dtype == torch.int64:
-            return None
-        if t.numel() < FUSED_ROWS or torch.compiler.is_compiling() or not usable(*given):
-            return None
-        if torch.is_grad_enabled() and any(x.requires_grad for x in given):
-            return None
-        kernel = located_kernel(self, group.name, table.shape[-1], derivatives, table.dtype)
-        if kernel is None:
-            return None
-        knots = flat(times.to(torch.float64))
-        outputs = [table.new_empty(t.shape[0], size) for size in kernel.results]
-        outside = kernel(flat(table), knots, flat(t), bounds(knots), [flat(x) for x in outputs])
-        return None if outside else outputs
-
 
 @cache
 def located_kernel(
-    scheme: CurveScheme, group: str, columns: int, derivatives: int, dtype: torch.dtype
+    scheme: Scheme, group: str, columns: int, derivatives: int, dtype: torch.dtype
 ) -> CurveKernel | None:
     """The scheme on its table, compiled; None if that would be too long a code."""
     algebra = arithmetic(group)
@@ -129,7 +133,7 @@ def located_kernel(
             factor = factor * inverse[0]
         return results
 
-    if len(trace(lambda *x: run(*x), [columns, 1, 1], dtype, near=True).operations) > LONGEST:
+    if len(trace(run, [columns, 1, 1], dtype, near=True).operations) > LONGEST:
         return None
     name = f"{type(scheme).__name__}_{group}_{columns}_d{derivatives}_located"
     results = [algebra.point_size, *[algebra.tangent_size] * derivatives]
