@@ -7,11 +7,12 @@ from spline_cases import close
 from test_interpolation import UNEVEN, group_of, keyframes
 
 import torchspline
-from torchspline import SO3
+from torchspline import R3, SE3, SO3, HermiteSpline, NonuniformBSpline, product
 from torchspline.functional import interpolate
 from torchspline.kernels.curve import CurveKernel
 from torchspline.splines.interpolation import SCHEMES
-from torchspline.splines.interpolation.scheme import curve_kernel, located_kernel
+from torchspline.splines.interpolation.scheme import curve_kernel
+from torchspline.splines.located import located_kernel
 
 float64 = torch.float64
 
@@ -87,6 +88,38 @@ def test_one_loop_refuses_what_it_does_not_know():
 
 
 def test_long_curves_are_not_compiled():
-    assert located_kernel(SCHEMES["linear"], "SO3", 8, 2, float64) is not None
+    assert located_kernel(SCHEMES["linear"].components, "SO3", 8, 2, float64) is not None
     assert curve_kernel(SCHEMES["linear"], "SO3", 8, 2, float64) is not None
     assert curve_kernel(SCHEMES["bezier"], "SE3", 70, 2, float64) is None
+
+
+def trajectories():
+    rates = 0.5 * kit.normal(2, 7, 6, seed=1)
+    values = keyframes(SE3)
+    knots = torch.cat([UNEVEN[:1].expand(3), UNEVEN, UNEVEN[3:4], UNEVEN[-1:].expand(3)]).sort().values
+    split = product(R3, SO3)
+    points = split.random(len(knots) - 4, generator=kit.generator(3))
+    yield HermiteSpline(values, *rates, group=SE3, times=UNEVEN, learnable=False)
+    yield HermiteSpline(
+        values, *rates, group=SE3, times=UNEVEN, learnable=False, coordinates="logarithm", frame="world"
+    )
+    yield NonuniformBSpline(points, group=split, knots=knots, learnable=False)
+    # An end of the domain that comes more than once, with segments of no duration before it.
+    knots = torch.cat([UNEVEN[:1] - 1.0, UNEVEN, UNEVEN[-1:].expand(2), UNEVEN[-1:] + 1.0])
+    points = SO3.random(len(knots) - 3, generator=kit.generator(4))
+    yield NonuniformBSpline(points, group=SO3, knots=knots, order=3, learnable=False)
+
+
+@pytest.mark.parametrize("spline", [*trajectories()], ids=["product", "logarithm", "clamped", "repeated"])
+def test_one_loop_for_other_curves(spline):
+    pytest.importorskip("numba")
+    start, end = spline.domain
+    t = torch.linspace(start, end, 5001, dtype=float64)
+    found = []
+    for mode in ("auto", "reference"):
+        with torchspline.use_kernels(mode):
+            found.append(spline.evaluate(t, 2))
+    kernels = located_kernel.cache_info().currsize
+    for ours, theirs in zip(*(state[:3] for state in found), strict=True):
+        assert close(ours, theirs, 1e-12)
+    assert kernels > 0

@@ -246,7 +246,7 @@ def emit_curve(
     name: str, near: Trace, far: Trace | None, columns: int, results: list[int], dtype: torch.dtype
 ) -> str:
     """`name(table, knots, times, start, end, out0, ..., begin, stop)`: a curve made of segments, row s of the table
-    (of so many columns) telling what it is between knots s and s + 1, which increase. Returns how many times lie
+    (of so many columns) telling what it is between knots s and s + 1. Returns how many times lie
     outside of start and end.
 
     Program inputs: u within the segment, one over its duration, the row. Neighbouring times mostly share a segment;
@@ -280,6 +280,8 @@ def emit_curve(
     parts = {
         "before": [
             "outside, segment, last = 0, 0, len(knots) - 2",
+            "while last > 0 and knots[last] == knots[last + 1]:",  # knots may come more than once
+            "    last -= 1",
             "first, second, inverse = np.inf, np.inf, 0.0",
             *_BASES,
         ],

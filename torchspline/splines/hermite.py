@@ -11,6 +11,7 @@ Two curves between the same ends, the same on a commutative group:
 which is [E17] applied to the inverse motion. `frame="world"` is [E17] to the letter.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 from math import factorial
 from typing import Literal, NamedTuple
@@ -20,8 +21,10 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.arithmetic import jet
+from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES, difference_reverse, forward, reverse
-from torchspline.arithmetic.vector import Vector, add, scale, zero
+from torchspline.arithmetic.scalar import Scalar
+from torchspline.arithmetic.vector import Vector, add, plus, scale, times, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.group import Group, Side
 from torchspline.groups.operations import geodesics
@@ -123,13 +126,61 @@ def _fields(
         return geodesics(group.name, start, steps.unflatten(-1, (5, group.tangent_size)), weights)
     algebra = group.arithmetic
     tangents = [split(x) for x in steps.split(group.tangent_size, dim=-1)]
+    by_row = [row.unbind(-1) for row in weights.unbind(-2)]
+    found = _logarithm(algebra, split(start), tangents, by_row, derivatives)
+    return tuple(join(field, rows) for field in found)
+
+
+def _product_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """The same on the components of one row, for `coordinates="product"`."""
+    start, tangents = _parts(group, row)
+    value, trace = forward(group, start, tangents, _quintics(u, derivatives), derivatives)
+    return [value, *trace[-1].rates]
+
+
+def _logarithm_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """Likewise for `coordinates="logarithm"`."""
+    start, tangents = _parts(group, row)
+    return _logarithm(group, start, tangents, _quintics(u, derivatives), derivatives)
+
+
+def _parts(group: GroupArithmetic, row: Vector) -> tuple[Vector, list[Vector]]:
+    size, tangent = group.point_size, group.tangent_size
+    return row[:size], [row[i : i + tangent] for i in range(size, len(row), tangent)]
+
+
+def _quintics(u: Scalar, derivatives: int) -> list[list[Scalar]]:
+    """a_1 ... a_5 and their derivatives at one u."""
+    rows: list[list[Scalar]] = []
+    for r in range(derivatives + 1):
+        row: list[Scalar] = []
+        for j in range(len(QUINTICS)):
+            value: Scalar = 0.0
+            for column in reversed(_COLUMNS[derivatives]):
+                value = plus(times(value, u), column[r][j])
+            row.append(value)
+        rows.append(row)
+    return rows
+
+
+def _logarithm(
+    group: GroupArithmetic,
+    start: Vector,
+    tangents: Sequence[Vector],
+    weights: Sequence[Sequence[Scalar]],
+    derivatives: int,
+) -> list[Vector]:
+    """`start Exp(phi)` and its rates, phi the sum of the tangents with these weights."""
     taylor = []
-    for r, row in enumerate(weights.unbind(-2)):
-        terms = (scale(a / factorial(r), p) for a, p in zip(row.unbind(-1), tangents, strict=True))
+    for r, row in enumerate(weights):
+        terms = (scale(a * (1.0 / factorial(r)), p) for a, p in zip(row, tangents, strict=True))
         taylor.append(add(*terms))
     x = tuple(map(jet.Jet, *taylor))
-    value = algebra.compose(split(start), algebra.exp(jet.values(x, 0)))
-    return tuple(join(field, rows) for field in (value, *jet.logarithmic_rates(algebra, x, derivatives)))
+    value = group.compose(start, group.exp(jet.values(x, 0)))
+    return [value, *jet.logarithmic_rates(group, x, derivatives)]
+
+
+_COMPONENTS = {"product": _product_components, "logarithm": _logarithm_components}
 
 
 def _from_world(
@@ -200,7 +251,9 @@ def _evaluate(
     def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
         return _fields(rows, u, group, coordinates, needed)
 
-    state = evaluate_segments(table, fields, group, t, times, derivatives, extrapolate, validate)
+    state = evaluate_segments(
+        table, fields, group, t, times, derivatives, extrapolate, validate, _COMPONENTS[coordinates]
+    )
     if frame == "body":
         return state
     value = group.inverse(state.value, validate=False)

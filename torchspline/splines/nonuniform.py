@@ -11,6 +11,9 @@ from torch import Tensor, nn
 
 from torchspline import checks
 from torchspline.arithmetic import jet
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.jet import Jet
+from torchspline.arithmetic.recurrence import forward
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, plus, times
 from torchspline.groups.components import join, split
@@ -95,6 +98,18 @@ def step_fields(group: Group, rows: Tensor, u: Tensor, derivatives: int, steps: 
     return geodesics(group.name, start, moves.unflatten(-1, (steps, group.tangent_size)), weights)
 
 
+def step_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """The same on the components of one row."""
+    size, tangent = group.point_size, group.tangent_size
+    steps = (len(row) - size) // (tangent + 2)
+    moves = [row[size + j * tangent : size + (j + 1) * tangent] for j in range(steps)]
+    local = tuple(Jet(knot, *(0.0,) * derivatives) for knot in row[size + steps * tangent :])
+    sums = tuple(cumulative_basis(local, jet.variable(u, derivatives)))
+    weights = [jet.values(sums, r) for r in range(derivatives + 1)]
+    value, trace = forward(group, row[:size], moves, weights, derivatives)
+    return [value, *trace[-1].rates]
+
+
 def signs_continued(points: Tensor, group: Group) -> Tensor:
     """Unit, each quaternion on the side of its predecessor."""
     algebra = group.arithmetic
@@ -144,7 +159,9 @@ def nonuniform_bspline(
     def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
         return step_fields(group, rows, u, needed, order - 1)
 
-    return evaluate_segments(table, fields, group, t, domain, derivatives, extrapolate, validate)
+    return evaluate_segments(
+        table, fields, group, t, domain, derivatives, extrapolate, validate, step_components
+    )
 
 
 def _check_knots(knots: Any, control_points: Tensor, order: int) -> None:

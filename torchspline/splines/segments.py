@@ -11,6 +11,7 @@ from torchspline import checks
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import Group
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate
+from torchspline.splines.located import Components, located, rounding
 from torchspline.splines.trajectory import State
 
 #: From rows (*batch, n, C) of a table, u (n,) or (*batch, n) within [0, 1] and a number of derivatives to the value and
@@ -114,7 +115,7 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
         duration = duration * NANOSECOND
     # A few rounding errors beyond the ends belong to the domain.
     ends = knots.detach()
-    slack = 0 if nanoseconds else _rounding(t.dtype) * (ends.abs().amax() + ends[-1] - ends[0])
+    slack = 0 if nanoseconds else rounding(t.dtype) * (ends.abs().amax() + ends[-1] - ends[0])
     outside = ~((s.detach() >= ends[0] - slack) & (s.detach() <= ends[-1] + slack))
     if extrapolate != "error":
         inside = torch.where(outside, u.clamp(0.0, 1.0), u)
@@ -122,17 +123,6 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     if validate and not _refuse(outside, t, knots):
         u = torch.where(outside, torch.nan, u)
     return Place(segment, u, duration, None)
-
-
-def _rounding(dtype: torch.dtype) -> float:
-    return 8.0 * torch.finfo(torch.float32 if dtype == torch.float32 else torch.float64).eps
-
-
-def bounds(knots: Any) -> tuple[float, float]:
-    """First and last time that belong to knots (an array of float64), a few rounding errors beyond the ends."""
-    start, end = float(knots[0]), float(knots[-1])
-    slack = _rounding(torch.float64) * (max(abs(start), abs(end)) + end - start)
-    return start - slack, end + slack
 
 
 def _check_rounding(t: Tensor, steps: Tensor) -> None:
@@ -190,13 +180,19 @@ def evaluate_segments(
     derivatives: int,
     extrapolate: Extrapolate,
     validate: bool,
+    components: Components | None = None,
 ) -> State:
     """Value and rates per second of a curve made of segments.
 
     Args:
         table: (*batch, M - 1, C), what determines each segment. fields: the curve from that.
         times: (M,) seconds or int64 nanoseconds, as `t`, of the M - 1 segments.
+        components: the same as `fields` on components, for loops that may be compiled.
     """
+    if components is not None:
+        found = located(components, group, table, t, times, derivatives)
+        if found is not None:
+            return State(*found)
     dtype = table.dtype
     aligned, common, shape = align(t, table.shape[:-2])
     place = locate_between(aligned, times, extrapolate, validate)

@@ -4,15 +4,13 @@ numbers (2)."""
 import torch
 from torch import Tensor
 
-from torchspline.arithmetic import jet
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.jet import Jet
-from torchspline.arithmetic.recurrence import forward
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, add, scale
 from torchspline.groups.group import Group
 from torchspline.splines.interpolation.scheme import CurveScheme, Properties, Scheme
-from torchspline.splines.nonuniform import basis, cumulative_basis, local_knots, step_fields, step_table
+from torchspline.splines.nonuniform import basis, local_knots, step_components, step_fields, step_table
 
 _ORDER = 4
 
@@ -55,13 +53,7 @@ class CumulativeBSpline(Scheme):
         return step_fields(group, rows, u, derivatives, _ORDER - 1)
 
     def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
-        size, moves = group.point_size, (_ORDER - 1) * group.tangent_size
-        steps = [row[i : i + group.tangent_size] for i in range(size, size + moves, group.tangent_size)]
-        local = tuple(Jet(knot, *(0.0,) * derivatives) for knot in row[size + moves :])
-        sums = tuple(cumulative_basis(local, jet.variable(u, derivatives)))
-        weights = [jet.values(sums, r) for r in range(derivatives + 1)]
-        value, trace = forward(group, row[:size], steps, weights, derivatives)
-        return [value, *trace[-1].rates]
+        return step_components(group, row, u, derivatives)
 
 
 class BlendedBSpline(CurveScheme):

@@ -68,10 +68,9 @@ def interpolate(
     keys = signs_continued(keyframes, of) if way == "short" else _unit(keyframes, of)
     table = scheme.table(of, keys, times, **options)
     ends, fields = scheme.segments(times), partial(scheme.fields, of)
-    found = scheme.evaluate(of, table, t, ends, derivatives)
-    if found is not None:
-        return State(*found)
-    return evaluate_segments(table, fields, of, t, ends, derivatives, extrapolate, validate)
+    return evaluate_segments(
+        table, fields, of, t, ends, derivatives, extrapolate, validate, scheme.components
+    )
 
 
 def _unit(keyframes: Tensor, group: Group) -> Tensor:

@@ -16,18 +16,14 @@ from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.jet import Jet
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.scalar import Scalar
-from torchspline.arithmetic.vector import Vector, scale
+from torchspline.arithmetic.vector import Vector
 from torchspline.groups.components import join, split
 from torchspline.groups.group import Group
 from torchspline.groups.operations import FUSED_ROWS
-from torchspline.kernels.curve import CurveKernel
 from torchspline.kernels.mode import flat, usable
 from torchspline.kernels.rowwise import RowKernel
 from torchspline.kernels.trace import trace
-from torchspline.splines.segments import bounds
-
-#: Most operations of a curve that is compiled.
-LONGEST = 2000
+from torchspline.splines.located import LONGEST
 
 
 @dataclass(frozen=True)
@@ -70,26 +66,6 @@ class Scheme(ABC):
     def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
         """The same on components."""
 
-    def evaluate(
-        self, group: Group, table: Tensor, t: Tensor, times: Tensor, derivatives: int
-    ) -> list[Tensor] | None:
-        """Value and rates per second of one curve at many times (N,), by one compiled loop that also finds where they
-        fall; None where there is none for this call, or a time lies outside."""
-        given = (table, t, times)
-        if table.ndim != 2 or t.ndim != 1 or t.dtype != torch.float64 or times.dtype == torch.int64:
-            return None
-        if t.numel() < FUSED_ROWS or torch.compiler.is_compiling() or not usable(*given):
-            return None
-        if torch.is_grad_enabled() and any(x.requires_grad for x in given):
-            return None
-        kernel = located_kernel(self, group.name, table.shape[-1], derivatives, table.dtype)
-        if kernel is None:
-            return None
-        knots = flat(times.to(torch.float64))
-        outputs = [table.new_empty(t.shape[0], size) for size in kernel.results]
-        outside = kernel(flat(table), knots, flat(t), bounds(knots), [flat(x) for x in outputs])
-        return None if outside else outputs
-
 
 class CurveScheme(Scheme):
     """A scheme that is written as group operations; power series for u give its rates."""
@@ -116,28 +92,6 @@ class CurveScheme(Scheme):
         """The same by tensor operations."""
         fields = self.components(group.arithmetic, split(rows), u, derivatives)
         return tuple(join(x, rows) for x in fields)
-
-
-@cache
-def located_kernel(
-    scheme: Scheme, group: str, columns: int, derivatives: int, dtype: torch.dtype
-) -> CurveKernel | None:
-    """The scheme on its table, compiled; None if that would be too long a code."""
-    algebra = arithmetic(group)
-
-    def run(row: Vector, u: Vector, inverse: Vector) -> list[Scalar]:
-        value, *rates = scheme.components(algebra, row, u[0], derivatives)
-        results, factor = list(value), inverse[0]
-        for rate in rates:
-            results += scale(factor, rate)
-            factor = factor * inverse[0]
-        return results
-
-    if len(trace(run, [columns, 1, 1], dtype, near=True).operations) > LONGEST:
-        return None
-    name = f"{type(scheme).__name__}_{group}_{columns}_d{derivatives}_located"
-    results = [algebra.point_size, *[algebra.tangent_size] * derivatives]
-    return CurveKernel(name, run, columns, results, dtype)
 
 
 @cache
