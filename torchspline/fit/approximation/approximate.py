@@ -21,6 +21,7 @@ from torchspline.fit.approximation.families import FAMILIES, Family, nearest, ro
 from torchspline.fit.approximation.pieces import uniform_breaks
 from torchspline.fit.approximation.source import Source, plain
 from torchspline.groups.group import R3, SO3, Group, product
+from torchspline.kernels.mode import use_kernels
 from torchspline.splines.bspline import SplitBSpline
 from torchspline.splines.interpolation import SCHEMES, SURVEY, KeyframeSpline
 from torchspline.splines.trajectory import Trajectory
@@ -106,7 +107,23 @@ def approximate(
     target: Family = makes(result_group, source.pieces, **options)
     breaks = _breaks(source, target, knots, limits is not None)
 
-    same = target.same(given) if knots is None and given.group == result_group else None
+    # Compiling loops for every group and order that a fit meets would take longer than the fit.
+    with use_kernels("reference"):
+        return _made(trajectory, source, target, breaks, limits, max_points, knots is None)
+
+
+def _made(
+    trajectory: Trajectory,
+    source: Source,
+    target: Family,
+    breaks: Tensor,
+    limits: tuple[float, float] | None,
+    max_points: int,
+    free: bool,
+) -> Approximation:
+    """Of checked arguments; `free`: nobody said which knots to use."""
+    given = source.trajectory
+    same = target.same(given) if free and given.group == source.group else None
     if same is not None:
         return Approximation(same, True, compare(same, trajectory))
     if limits is None:
@@ -115,7 +132,7 @@ def approximate(
         made = target.build(source, breaks, times)
         exact = target.represents(source, breaks, times)
     else:
-        made, exact = _kept(source, target, breaks, limits, max_points, knots is None)
+        made, exact = _kept(source, target, breaks, limits, max_points, free)
     made = _like(made, source, trajectory)
     return Approximation(made, exact, compare(made, trajectory))
 
