@@ -17,6 +17,7 @@ from torchspline import (
     KeyframeSpline,
     NonuniformBSpline,
     SplitBSpline,
+    State,
     Trajectory,
     product,
 )
@@ -193,8 +194,6 @@ class Helix(Trajectory):
         return (0.0, 3.0)
 
     def evaluate(self, t, derivatives=2):
-        from torchspline import State
-
         w = torch.tensor([0.4, 0.0, 0.1, 0.0, 0.3, 1.1], dtype=t.dtype)
         value = SE3.compose(SE3.exp(t[..., None] * w), SE3.exp(torch.sin(2 * t)[..., None] * w.flip(0)))
         return State(value, torch.zeros_like(value[..., :6]), torch.zeros_like(value[..., :6]))
