@@ -185,7 +185,9 @@ def _choose(times: Tensor, data: Sequence[_Data], order: int) -> float:
         knots = Knots(times, spacing, order)
         if knots.count < samples:
             _, left = _solve(knots, times, data)
-            score = float(np.log(np.maximum(left, 1e-300)).mean()) - 2.0 * math.log(1.0 - knots.count / samples)
+            score = float(np.log(np.maximum(left, 1e-300)).mean()) - 2.0 * math.log(
+                1.0 - knots.count / samples
+            )
             since += 1
             if score < least:
                 best, least, since = spacing, score, 0
@@ -207,7 +209,9 @@ def _noise(times: Tensor, values: Array, order: int) -> tuple[Array, float]:
 
 def _check(t: Tensor, positions: Tensor, velocities: Tensor | None) -> None:
     if not isinstance(t, Tensor):
-        raise TypeError(f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor")
+        raise TypeError(
+            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
+        )
     if t.dtype not in (torch.float64, torch.int64):
         raise TypeError(f"t: expected float64 seconds or int64 nanoseconds, got {t.dtype}")
     checks.is_floating_tensor("positions", positions)

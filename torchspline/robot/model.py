@@ -160,12 +160,21 @@ class Robot:
             checks.same_kind(q=q, base=base)
         return _motion(paths, joints, base, several)
 
-    def link(self, joints: Trajectory, link: str | Sequence[str], base: Tensor | None = None) -> "LinkTrajectory":
+    def link(
+        self, joints: Trajectory, link: str | Sequence[str], base: Tensor | None = None
+    ) -> "LinkTrajectory":
         """The trajectory of a link whose joints follow `joints`, see `LinkTrajectory`."""
         return LinkTrajectory(self, joints, link, base)
 
     def residual(
-        self, link: str, kind: type[Residual], t: Tensor, measured: Tensor, *, base: Tensor | None = None, **options: Any
+        self,
+        link: str,
+        kind: type[Residual],
+        t: Tensor,
+        measured: Tensor,
+        *,
+        base: Tensor | None = None,
+        **options: Any,
     ) -> Residual:
         """A sensor on a link, as a residual of a spline of the joints: `fit.Problem(spline).add(...)`.
 
@@ -182,7 +191,9 @@ class Robot:
         """
         path = self._path(link)
         if not (isinstance(kind, type) and issubclass(kind, Residual)):
-            raise TypeError(f"kind: expected a class of residuals such as torchspline.fit.Gyroscope, got {kind!r}")
+            raise TypeError(
+                f"kind: expected a class of residuals such as torchspline.fit.Gyroscope, got {kind!r}"
+            )
         kind.check_group(SE3)
         pose = path.pose
         if base is not None:
@@ -190,7 +201,9 @@ class Robot:
             if base.shape != (7,):
                 raise ValueError(f"base: expected shape (7,), an SE3 pose, got {tuple(base.shape)}")
             pose = SE3.compose(base.detach().cpu().to(torch.float64), pose)
-        numbers = [tuple(x.tolist()) for x in (pose, path.screws.flatten(), path.index, path.factor, path.offset)]
+        numbers = [
+            tuple(x.tolist()) for x in (pose, path.screws.flatten(), path.index, path.factor, path.offset)
+        ]
         bound = on_link(kind, link, self.dof, *numbers)
         return bound(t, measured, **{"name": f"{kind.__name__} on {link}", **options})
 
@@ -208,7 +221,7 @@ class Robot:
                 moves.append(move)
         seen = np.array(screws).reshape(-1, 6) @ _adjoint(np.linalg.inv(pose)).T
         if not moves:  # a link that does not move is carried by a joint that does not count
-            return Path(_pose(pose), torch.zeros(1, 6).double(), *_numbers([(0, 0.0, 0.0)]))
+            return Path(_pose(pose), torch.zeros(1, 6, dtype=torch.float64), *_numbers([(0, 0.0, 0.0)]))
         names = self.joint_names
         rows = [(names.index(move.joint), move.factor, move.offset) for move in moves]
         return Path(_pose(pose), torch.from_numpy(seen), *_numbers(rows))
@@ -239,7 +252,9 @@ class Robot:
                 *batch, n = (int(k) for k in where) if t.ndim else (*map(int, where), 0)
                 time = t if t.ndim == 0 else t[n] if t.ndim == 1 else t.expand(over.shape)[(*batch, n)]
                 found.append(
-                    OverLimit(joint.name, quantity, time.item(), float(value[tuple(where)]), limit, tuple(batch))
+                    OverLimit(
+                        joint.name, quantity, time.item(), float(value[tuple(where)]), limit, tuple(batch)
+                    )
                 )
         return found
 
@@ -332,4 +347,4 @@ def _pose(T: np.ndarray) -> Tensor:
 
 def _numbers(rows: Sequence[tuple[int, float, float]]) -> tuple[Tensor, Tensor, Tensor]:
     index, factor, offset = zip(*rows, strict=True)
-    return torch.tensor(index), torch.tensor(factor).double(), torch.tensor(offset).double()
+    return torch.tensor(index), *(torch.tensor(x, dtype=torch.float64) for x in (factor, offset))

@@ -60,7 +60,9 @@ def transform(position: Sequence[float] | Array, rotation: Array | None = None) 
     return T
 
 
-def screw(kind: str, axis: Sequence[float] | Array, anchor: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> Array:
+def screw(
+    kind: str, axis: Sequence[float] | Array, anchor: Sequence[float] | Array = (0.0, 0.0, 0.0)
+) -> Array:
     """[v, omega] of a unit step: along the axis, or about it through the anchor."""
     unit = np.asarray(axis, float) / np.linalg.norm(axis)
     if kind == "prismatic":
@@ -76,7 +78,9 @@ def content(source: str | PathLike[str]) -> tuple[str, str]:
         raise TypeError(f"source: expected XML text or the path of a file, got {type(source).__name__}")
     path = Path(source)
     if not path.is_file():
-        raise FileNotFoundError(f"source: expected XML text or the path of a file, got {str(path)!r}: no such file")
+        raise FileNotFoundError(
+            f"source: expected XML text or the path of a file, got {str(path)!r}: no such file"
+        )
     return str(path), path.read_text(encoding="utf-8", errors="replace")
 
 
@@ -92,7 +96,9 @@ def from_urdf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
         # As bytes: lxml refuses text that declares an encoding.
         robot = URDF.from_xml_string(text.encode())
     except Exception as reason:  # the parser raises whatever comes, assertions included
-        raise ValueError(f"source: expected a URDF robot in {name}, got one that cannot be read: {reason}") from None
+        raise ValueError(
+            f"source: expected a URDF robot in {name}, got one that cannot be read: {reason}"
+        ) from None
     return _urdf_tree(robot)
 
 
@@ -103,7 +109,9 @@ def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
     for joint in robot.joints:
         for end in (joint.parent, joint.child):
             if end not in links:
-                raise ValueError(f"source: joint {joint.name!r} needs the link {end!r}; expected it among the links")
+                raise ValueError(
+                    f"source: joint {joint.name!r} needs the link {end!r}; expected it among the links"
+                )
         if joint.child in parent_of:
             raise ValueError(f"source: link {joint.child!r} has two parents; expected a tree")
         parent_of[joint.child] = joint.parent
@@ -195,7 +203,9 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
     try:
         model = mujoco.MjModel.from_xml_string(text)
     except ValueError as reason:
-        raise ValueError(f"source: expected an MJCF model in {name}, got one that cannot be read: {reason}") from None
+        raise ValueError(
+            f"source: expected an MJCF model in {name}, got one that cannot be read: {reason}"
+        ) from None
     kinds = {mujoco.mjtJoint.mjJNT_HINGE: "revolute", mujoco.mjtJoint.mjJNT_SLIDE: "prismatic"}
     joints, frames = [], []
     for b in range(model.nbody):
@@ -245,7 +255,10 @@ def from_chain(chain: Any) -> tuple[list[Joint], list[Frame]]:
         moves: tuple[Move, ...] = ()
         if frame.joint.joint_type != "fixed":
             lower, upper = frame.joint.limits or (-_NONE, _NONE)
-            most = [_NONE if x is None else float(x[1]) for x in (frame.joint.velocity_limits, frame.joint.effort_limits)]
+            most = [
+                _NONE if x is None else float(x[1])
+                for x in (frame.joint.velocity_limits, frame.joint.effort_limits)
+            ]
             joints.append(Joint(frame.joint.name, frame.joint.joint_type, float(lower), float(upper), *most))
             axis = frame.joint.axis.double().cpu().numpy()
             moves = (Move(frame.joint.name, screw(frame.joint.joint_type, axis)),)

@@ -52,7 +52,9 @@ def on_link(
         @classmethod
         def check_group(cls, group: Group) -> None:
             if group.name != f"R{dof}":
-                raise ValueError(f"{cls.__name__}: expected a trajectory of the joints, in R{dof}, got {group}")
+                raise ValueError(
+                    f"{cls.__name__}: expected a trajectory of the joints, in R{dof}, got {group}"
+                )
 
         def evaluate(
             self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
@@ -80,5 +82,7 @@ def on_link(
                 joints_g.append(Moment(value_g, tuple(rates_g)))
             return joints_g, given_g
 
-    OnLink.__name__ = OnLink.__qualname__ = f"{kind.__name__}On_{''.join(c if c.isalnum() else '_' for c in link)}"
+    OnLink.__name__ = OnLink.__qualname__ = (
+        f"{kind.__name__}On_{''.join(c if c.isalnum() else '_' for c in link)}"
+    )
     return OnLink
