@@ -20,8 +20,9 @@ from torchspline.splines.bspline import BSpline
 Array = NDArray[np.float64]
 #: Spacings that are tried: factor between them, samples a knot interval at least, knot intervals at least.
 _RATIO, _LEAST_SAMPLES, _LEAST_INTERVALS = 2**0.5, 1.5, 6
-#: Weight of squared second differences of control points, in samples an interval: bridges gaps.
-_SMOOTHNESS = 1e-9
+#: Weights of squared second differences of control points, in samples an interval, which bridge gaps: more where
+#: rounding asks for it.
+_SMOOTHNESS = (1e-13, 1e-10, 1e-7)
 
 
 @dataclass(frozen=True)
@@ -157,19 +158,29 @@ def _solve(knots: Knots, times: Tensor, data: Sequence[_Data]) -> tuple[Array, A
     dof = data[0].values.shape[1]
     points, left = np.empty((knots.count, dof)), np.zeros(dof)
     for d in range(dof):
-        # In units of the positions' noise, or of the velocities' over an interval: the matrix is near one.
-        scale = [(part.sigma[d] / data[0].sigma[d]) ** -2 for part in data]
-        band = _SMOOTHNESS * len(times) / knots.segments * bends * knots.seconds ** (-2 * data[0].derivative)
-        for s, gram in zip(scale, grams, strict=True):
-            band[: knots.order] += s * gram
-        # One constant is open if there are velocities alone; it does not count.
-        band[0] += 1e-12 * band[0].max()
-        right = sum(s * side[:, d : d + 1] for s, side in zip(scale, sides, strict=True))
-        points[:, d] = solve_band(band, np.asarray(right))[:, 0]
+        # In units of the noise of the first: numbers of the matrix are counts of samples.
+        band = np.zeros((len(bends), knots.count))
+        for part, gram in zip(data, grams, strict=True):
+            band[: knots.order] += (data[0].sigma[d] / part.sigma[d]) ** 2 * gram
+        right = sum(
+            (data[0].sigma[d] / part.sigma[d]) ** 2 * side[:, d : d + 1]
+            for part, side in zip(data, sides, strict=True)
+        )
+        points[:, d] = _solve_bending(band, bends * len(times) / knots.segments, np.asarray(right))
     for part in data:
         rest = part.values - _evaluate(knots, times, points, part.derivative)
         left += (rest**2).sum(0) / part.sigma**2
     return points, left
+
+
+def _solve_bending(band: Array, bends: Array, right: Array) -> Array:
+    """With as little smoothing as makes the matrix definite: what samples hold does not feel it."""
+    for smoothness in _SMOOTHNESS[:-1]:
+        try:
+            return solve_band(band + smoothness * bends, right)[:, 0]
+        except np.linalg.LinAlgError:
+            pass
+    return solve_band(band + _SMOOTHNESS[-1] * bends, right)[:, 0]
 
 
 def _choose(times: Tensor, data: Sequence[_Data], order: int) -> float:

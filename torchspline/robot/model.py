@@ -187,7 +187,7 @@ class Robot:
         Returns:
             Residual: of trajectories in R^dof. Its loops are not compiled.
         Raises:
-            TypeError, ValueError: no such link, no such kind, or what `kind` raises.
+            TypeError, ValueError: no such link or one that no joint moves, no such kind, or what `kind` raises.
         """
         path = self._path(link)
         if not (isinstance(kind, type) and issubclass(kind, Residual)):
@@ -195,6 +195,8 @@ class Robot:
                 f"kind: expected a class of residuals such as torchspline.fit.Gyroscope, got {kind!r}"
             )
         kind.check_group(SE3)
+        if not bool(path.factor.any()):
+            raise ValueError(f"link: expected one that joints move, got {link!r}")
         pose = path.pose
         if base is not None:
             checks.is_floating_tensor("base", base)
