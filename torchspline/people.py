@@ -73,10 +73,11 @@ def fit_body(t: Tensor, poses: Tensor, *, bandwidth: float, order: int = 6) -> S
     spacing = span / math.ceil(span / spacing - 1e-6)
     knots = Knots(times, spacing, order)
     if knots.count > len(times):
-        raise ValueError(f"t: expected at least {knots.count} times for as many control points, got {len(times)}")
+        raise ValueError(
+            f"t: expected at least {knots.count} times for as many control points, got {len(times)}"
+        )
     single = poses.ndim == 2
     measured = consistent_signs(poses.detach().to("cpu", torch.float64).reshape(-1, len(times), 7), _SPLIT)
-    J, N = measured.shape[:2]
     positions = _linear(knots, times, measured[..., :3], _SMOOTHNESS)
     solved = torch.cat([positions, _rotations(knots, times, measured[..., 3:], order)], -1)
     return SplitBSpline(solved[0] if single else solved, order=order, dt=spacing, t0=float(times[0]))
@@ -90,7 +91,7 @@ def _linear(knots: Knots, times: Tensor, values: Tensor, smoothness: float) -> T
 
 
 def _rotations(knots: Knots, times: Tensor, measured: Tensor, order: int) -> Tensor:
-    """Control points (J, M, 4) whose misses, as rotation vectors in the world, have next to no share in any basis function.
+    """Control points (J, M, 4) whose misses, rotation vectors in the world, have next to no share in any basis function.
 
     All control points turned by one rotation turn the curve by it, so that a linear fit of the misses is nearly the
     step to take. Least squares asks the same, up to the curvature of SO(3) over the few knots of a basis function.
@@ -143,7 +144,9 @@ def response(frequencies: Tensor, rate: float, *, bandwidth: float, order: int =
     middle = torch.linspace(0.25 * duration, 0.75 * duration, 20 * knots.segments, dtype=torch.float64)
     found = knots.evaluate(points, middle, derivative=2)
     # As a share of the true acceleration: its mean is the gain, its spread comes at other frequencies.
-    share = (found[:, : len(w)] + 1j * found[:, len(w) :]) / (-(w**2) * np.exp(1j * middle.numpy()[:, None] * w))
+    share = (found[:, : len(w)] + 1j * found[:, len(w) :]) / (
+        -(w**2) * np.exp(1j * middle.numpy()[:, None] * w)
+    )
     gain = share.mean(0)
     distortion = np.sqrt((np.abs(share - gain) ** 2).mean(0))
     few = torch.arange(0.0, 60.0 * spacing, 1.0 / rate, dtype=torch.float64)

@@ -14,7 +14,16 @@ from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
 from torchspline.io.text import Table, read_table
 
-__all__ = ["ImuRecord", "PoseRecord", "Skeleton", "read_bvh", "read_imu", "read_poses", "write_imu", "write_poses"]
+__all__ = [
+    "ImuRecord",
+    "PoseRecord",
+    "Skeleton",
+    "read_bvh",
+    "read_imu",
+    "read_poses",
+    "write_imu",
+    "write_poses",
+]
 
 _FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in (euroc, kitti, tum)}
 

@@ -46,9 +46,8 @@ class Skeleton:
     source: str = ""
 
     def __repr__(self) -> str:
-        return (
-            f"Skeleton({len(self.names)} joints, {len(self.values)} frames at {1 / self.interval:.5g} Hz, {self.source})"
-        )
+        frames = f"{len(self.values)} frames at {1 / self.interval:.5g} Hz"
+        return f"Skeleton({len(self.names)} joints, {frames}, {self.source})"
 
     @property
     def time(self) -> Tensor:
@@ -119,7 +118,9 @@ class _Parser:
                 self.number += 1
                 if len(line) == _LONGEST_LINE:
                     self.fail(f"lines below {_LONGEST_LINE} characters", "a longer one")
-                if fields := line.decode("utf-8-sig" if self.number == 1 else "utf-8", errors="replace").split():
+                if fields := line.decode(
+                    "utf-8-sig" if self.number == 1 else "utf-8", errors="replace"
+                ).split():
                     yield fields
         except (OSError, EOFError, zlib.error) as reason:
             self.fail("gzipped text", f"damaged data ({reason})")
@@ -168,15 +169,15 @@ class _Parser:
         """Up to the line MOTION; no recursion, however deep the joints go."""
         stack: list[int] = []
         while True:
-            word, *rest = self.next("a joint or MOTION" if not stack else "a joint, its OFFSET or CHANNELS, or }")
+            word, *rest = self.next(
+                "a joint or MOTION" if not stack else "a joint, its OFFSET or CHANNELS, or }"
+            )
             kind = word.upper()
             if kind == "}" and not rest and stack:
                 self.check_joint(stack.pop())
             elif kind == "MOTION" and not stack and self.names:
                 return
-            elif kind == "ROOT" and not stack:
-                self.joint(stack, " ".join(rest))
-            elif kind == "JOINT" and stack:
+            elif kind == ("JOINT" if stack else "ROOT"):
                 self.joint(stack, " ".join(rest))
             elif kind == "END" and stack and [x.upper() for x in rest] == ["SITE"]:
                 self.joint(stack, f"{self.names[stack[-1]]} end")
@@ -229,7 +230,9 @@ class _Parser:
             self.fail("seconds above zero between frames", f"{interval:g}")
         found = array("d")
         for i in range(int(frames)):
-            found.extend(self.numbers(self.next(f"{int(frames)} frames, {i} came"), columns, f"channels of frame {i}"))
+            found.extend(
+                self.numbers(self.next(f"{int(frames)} frames, {i} came"), columns, f"channels of frame {i}")
+            )
         if (more := next(self.lines, None)) is not None:
             self.fail(f"the end of the file after {int(frames)} frames", repr(" ".join(more)))
         return np.frombuffer(found, dtype=np.float64).reshape(-1, columns).copy(), interval
