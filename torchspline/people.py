@@ -91,7 +91,7 @@ def _linear(knots: Knots, times: Tensor, values: Tensor, smoothness: float) -> T
 
 
 def _rotations(knots: Knots, times: Tensor, measured: Tensor, order: int) -> Tensor:
-    """Control points (J, M, 4) whose misses, rotation vectors in the world, have next to no share in any basis function.
+    """Control points (J, M, 4) whose misses (rotation vectors, world) have next to no share in any basis function.
 
     All control points turned by one rotation turn the curve by it, so that a linear fit of the misses is nearly the
     step to take. Least squares asks the same, up to the curvature of SO(3) over the few knots of a basis function.

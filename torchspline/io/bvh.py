@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import NoReturn, Protocol
 
 import numpy as np
 import torch
@@ -102,8 +102,12 @@ def read_bvh(path: str | PathLike[str], unit: float = 0.01) -> Skeleton:
         return _Parser(file, stream).skeleton(unit)
 
 
+class _Stream(Protocol):
+    def readline(self, size: int, /) -> bytes: ...
+
+
 class _Parser:
-    def __init__(self, path: Path, stream: IO[bytes]):
+    def __init__(self, path: Path, stream: _Stream):
         self.path, self.number = path, 0
         self.lines = self._lines(stream)
         self.names: list[str] = []
@@ -111,7 +115,7 @@ class _Parser:
         self.offsets: list[list[float]] = []
         self.channels: list[tuple[str, ...]] = []
 
-    def _lines(self, stream: IO[bytes]) -> Iterator[list[str]]:
+    def _lines(self, stream: _Stream) -> Iterator[list[str]]:
         """Fields of lines that have some, a line in memory at a time."""
         try:
             while line := stream.readline(_LONGEST_LINE):

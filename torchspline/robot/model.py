@@ -27,7 +27,7 @@ class Path(NamedTuple):
     #: (n, 6), [v, omega] in the link's frame.
     screws: Tensor
     #: (n,): which coordinate drives each, by how much, and from where.
-    index: Tensor
+    driver: Tensor
     factor: Tensor
     offset: Tensor
 
@@ -204,7 +204,7 @@ class Robot:
                 raise ValueError(f"base: expected shape (7,), an SE3 pose, got {tuple(base.shape)}")
             pose = SE3.compose(base.detach().cpu().to(torch.float64), pose)
         numbers = [
-            tuple(x.tolist()) for x in (pose, path.screws.flatten(), path.index, path.factor, path.offset)
+            tuple(x.tolist()) for x in (pose, path.screws.flatten(), path.driver, path.factor, path.offset)
         ]
         bound = on_link(kind, link, self.dof, *numbers)
         return bound(t, measured, **{"name": f"{kind.__name__} on {link}", **options})
@@ -294,10 +294,8 @@ class LinkTrajectory(Trajectory):
         if base is not None:
             checks.is_floating_tensor("base", base)
             self._adopt("base", base, learnable=False)
-        start = joints.domain[0]
         probe = torch.zeros(robot.dof, dtype=torch.float64 if base is None else base.dtype)
         robot.motion(self.names, probe, base=None if base is None else base.detach().cpu())
-        del start, probe
 
     @property
     def domain(self) -> tuple[float, float] | tuple[int, int]:
@@ -309,12 +307,12 @@ class LinkTrajectory(Trajectory):
 
 
 def _motion(paths: Sequence[Path], joints: Sequence[Tensor], base: Tensor | None, several: bool) -> State:
-    most = max(len(path.index) for path in paths)
+    most = max(len(path.driver) for path in paths)
     like = joints[0]
     pose, screws, factor, offset = (
         torch.stack([_padded(path[i], most if i else None) for path in paths]).to(like) for i in (0, 1, 3, 4)
     )
-    index = torch.stack([_padded(path.index, most) for path in paths]).to(like.device)
+    index = torch.stack([_padded(path.driver, most) for path in paths]).to(like.device)
     rows = []
     for r, x in enumerate(joints):
         # (..., L, n), then links in front
@@ -348,5 +346,6 @@ def _pose(T: np.ndarray) -> Tensor:
 
 
 def _numbers(rows: Sequence[tuple[int, float, float]]) -> tuple[Tensor, Tensor, Tensor]:
-    index, factor, offset = zip(*rows, strict=True)
-    return torch.tensor(index), *(torch.tensor(x, dtype=torch.float64) for x in (factor, offset))
+    driver, factor, offset = zip(*rows, strict=True)
+    factors, offsets = (torch.tensor(x, dtype=torch.float64) for x in (factor, offset))
+    return torch.tensor(driver), factors, offsets

@@ -27,7 +27,7 @@ def on_link(
     """The class of residuals of trajectories in R^dof: numbers of the chain are constants of it, as most are zero.
 
     Args:
-        kind: of a body on SE3. pose, screws, index, factor, offset: as `model.Path`, in a row.
+        kind: of a body on SE3. pose, screws, index, factor, offset: as `model.Path`; `index` its drivers.
     """
     se3 = arithmetic("SE3")
     steps = [tuple(screws[6 * j : 6 * j + 6]) for j in range(len(index))]
