@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import error_online
+import error_robot
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
@@ -68,7 +69,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_robot.ROOTS):
         visit(root)
     return found
 
@@ -83,11 +84,13 @@ RESULTS = {
     "BatchResult",
     "Alignment",
     "Differentials",
+    *error_robot.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    **error_robot.UNTRIED,
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",

@@ -1,5 +1,7 @@
 """Robots: links against matrices worked out from the XML, rates against differences, gradients, the traps of others."""
 
+import sys
+
 import numpy as np
 import pytest
 import pytorch_kinematics as pk
@@ -264,6 +266,25 @@ def test_mjcf_against_mujoco():
         expected = np.eye(4)
         expected[:3, :3], expected[:3, 3] = at.xmat.reshape(3, 3), at.xpos
         assert np.abs(SE3.to_matrix(pose).numpy() - expected).max() < 1e-12, name
+
+
+def test_bad_mjcf():
+    pytest.importorskip("mujoco")
+    text = "<mujoco><worldbody><body name='a'><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    for bad, kind, message in (
+        (text, ValueError, "source: .* free or a ball; expected hinge or slide"),
+        ("<nonsense", ValueError, "source: expected an MJCF model in source"),
+        (5, TypeError, "source: expected XML text or the path of a file, got int"),
+        ("missing.xml", FileNotFoundError, "source: .*: no such file"),
+    ):
+        with pytest.raises(kind, match=message):
+            Robot.from_mjcf(bad)
+
+
+def test_mjcf_without_mujoco_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"pip install 'torchspline\[mjcf\]'"):
+        Robot.from_mjcf("<mujoco/>")
 
 
 # ---------------------------------------------------------------------- limits

@@ -129,7 +129,7 @@ def response(frequencies: Tensor, rate: float, *, bandwidth: float, order: int =
         raise ValueError(f"frequencies: expected shape (F,), got {tuple(frequencies.shape)}")
     checks.finite("frequencies", frequencies)
     if not bool((frequencies > 0).all()):
-        raise ValueError("frequencies: expected Hz above zero, got others")
+        raise ValueError(f"frequencies: expected Hz above zero, got {frequencies.min().item():g}")
     checks.positive("rate", rate)
     checks.positive("bandwidth", bandwidth)
     checks.whole("order", order, least=4)

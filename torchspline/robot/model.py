@@ -139,26 +139,24 @@ class Robot:
         rates = [q, velocity, acceleration, jerk]
         given = next((i for i, x in enumerate(rates) if x is None), 4)
         names = ("q", "velocity", "acceleration", "jerk")
-        for name, x in zip(names, rates, strict=True):
-            if x is None:
+        joints: list[Tensor] = []
+        for i, (name, given_x) in enumerate(zip(names, rates, strict=True)):
+            if given_x is None and i > 0:
                 continue
-            if names.index(name) >= given:
+            if i > given:
                 raise ValueError(f"{name}: expected {names[given]}, too, got none")
-            checks.is_floating_tensor(name, x)
+            x = checks.is_floating_tensor(name, given_x)
             checks.has_last(name, x, self.dof, f"one for each of {', '.join(self.joint_names)}")
-            checks.same_kind(**{"q": q, name: x})
-        joints = torch.broadcast_tensors(*(x for x in rates if x is not None))
-        several = not isinstance(link, str)
-        paths = [self._path(name) for name in (link if several else [link])]
-        if not paths:
-            raise ValueError("link: expected the name of a link, or several, got none")
+            joints.append(x)
+            checks.same_kind(**{"q": joints[0], name: x})
+            checks.finite(name, x)
+        checks.broadcast(**{name: x.shape for name, x in zip(names, joints, strict=False)})
+        joints = list(torch.broadcast_tensors(*joints))
+        paths = self._paths(link)
         if base is not None:
-            checks.is_floating_tensor("base", base)
-            if base.shape != (7,):
-                raise ValueError(f"base: expected shape (7,), an SE3 pose, got {tuple(base.shape)}")
-            checks.point("base", base, SE3, "an SE3 pose")
+            _check_base(base)
             checks.same_kind(q=q, base=base)
-        return _motion(paths, joints, base, several)
+        return _motion(paths, joints, base, not isinstance(link, str))
 
     def link(
         self, joints: Trajectory, link: str | Sequence[str], base: Tensor | None = None
@@ -199,9 +197,7 @@ class Robot:
             raise ValueError(f"link: expected one that joints move, got {link!r}")
         pose = path.pose
         if base is not None:
-            checks.is_floating_tensor("base", base)
-            if base.shape != (7,):
-                raise ValueError(f"base: expected shape (7,), an SE3 pose, got {tuple(base.shape)}")
+            _check_base(base)
             pose = SE3.compose(base.detach().cpu().to(torch.float64), pose)
         numbers = [
             tuple(x.tolist()) for x in (pose, path.screws.flatten(), path.driver, path.factor, path.offset)
@@ -209,8 +205,16 @@ class Robot:
         bound = on_link(kind, link, self.dof, *numbers)
         return bound(t, measured, **{"name": f"{kind.__name__} on {link}", **options})
 
+    def _paths(self, link: Any) -> list[Path]:
+        if not isinstance(link, (str, Sequence)):
+            raise TypeError(f"link: expected the name of a link, or several, got {type(link).__name__}")
+        paths = [self._path(name) for name in ([link] if isinstance(link, str) else link)]
+        if not paths:
+            raise ValueError("link: expected the name of a link, or several, got none")
+        return paths
+
     def _path(self, link: Any) -> Path:
-        if link not in self._frames:
+        if not isinstance(link, str) or link not in self._frames:
             raise ValueError(f"link: expected one of {', '.join(self.links)}, got {link!r}")
         frames = [self._frames[link]]
         while (parent := frames[-1].parent) is not None:
@@ -289,13 +293,12 @@ class LinkTrajectory(Trajectory):
         checks.instance("robot", robot, Robot, "a torchspline.robot.Robot")
         robot._check_joints(joints)
         self.robot, self.joints = robot, joints
+        self._paths = robot._paths(link)
         self.names = link if isinstance(link, str) else tuple(link)
         self.base: Tensor | None = None
         if base is not None:
-            checks.is_floating_tensor("base", base)
+            _check_base(base)
             self._adopt("base", base, learnable=False)
-        probe = torch.zeros(robot.dof, dtype=torch.float64 if base is None else base.dtype)
-        robot.motion(self.names, probe, base=None if base is None else base.detach().cpu())
 
     @property
     def domain(self) -> tuple[float, float] | tuple[int, int]:
@@ -303,7 +306,18 @@ class LinkTrajectory(Trajectory):
 
     def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
         """Pose and its rates at the times `t`; see `Trajectory.evaluate` and `Robot.motion`."""
-        return self.robot.motion(self.names, *self.joints.evaluate(t, derivatives), base=self.base)
+        state = self.joints.evaluate(t, derivatives)
+        if self.base is not None:
+            checks.same_kind(joints=state.value, base=self.base)
+        rows = [x for x in state if x is not None]
+        return _motion(self._paths, rows, self.base, not isinstance(self.names, str))
+
+
+def _check_base(base: Any) -> None:
+    checks.is_floating_tensor("base", base)
+    if base.shape != (7,):
+        raise ValueError(f"base: expected shape (7,), an SE3 pose, got {tuple(base.shape)}")
+    checks.point("base", base, SE3, "an SE3 pose")
 
 
 def _motion(paths: Sequence[Path], joints: Sequence[Tensor], base: Tensor | None, several: bool) -> State:
