@@ -254,8 +254,7 @@ def encoders() -> Iterator[Case]:
 
 def bodies() -> Iterator[Case]:
     function, shapes = "fit_body", "shapes (N,) and (J, N, 7)"
-    for case in tensor(function, "poses", "s (N,) and (J, N, 7)", slice(3, 7), like=WALK, named="t, poses"):
-        yield case
+    yield from tensor(function, "poses", "s (N,) and (J, N, 7)", slice(3, 7), like=WALK, named="t, poses")
     yield refused(function, "t", "type", 0.1, "got float", "a torch.Tensor")
     yield refused(
         function, "t", "dtype", FRAMES.to(torch.int64), "torch.int64", "torch.float32 or torch.float64"

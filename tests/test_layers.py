@@ -21,6 +21,7 @@ LAYERS = [
     {"imu"},
     {"fit"},
     {"functional", "robot", "people", "io", "plot"},
+    {"cli_body"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -95,11 +95,11 @@ def test_acceleration_and_jerk_against_forward_mode():
 def test_gradients_of_joints_to_second_order():
     """Double backward included, which pytorch-kinematics gets wrong by default."""
     spline = joint_spline(count=4, order=4)
-    link, t = ROBOT.link(spline, "right"), torch.tensor([0.11], dtype=F64)
+    link, t = ROBOT.link(spline, "wrist"), torch.tensor([0.11], dtype=F64)
 
     def motion(points):
         value = torch.func.functional_call(link, {"joints.control_points": points}, (t,))
-        rates = ROBOT.motion("right", points[1], points[2], points[3])
+        rates = ROBOT.motion("head", points[1], points[2], points[3])
         return value, rates.velocity, rates.acceleration
 
     points = spline.control_points.detach().requires_grad_()
@@ -133,6 +133,12 @@ def test_transforms_of_torch_func():
     torch.testing.assert_close(
         bends, torch.func.jacrev(torch.func.jacrev(lambda q: pose(q).square().sum()))(q[0])
     )
+
+
+def test_compiled_without_graph_breaks():
+    link, t = ROBOT.link(joint_spline(learnable=False), "tip"), torch.linspace(0.0, 1.5, 5, dtype=F64)
+    compiled = torch.compile(lambda t: link.evaluate(t).acceleration, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(t), link.evaluate(t).acceleration)
 
 
 def test_twist_is_the_jacobian_times_the_rates():

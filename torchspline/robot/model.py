@@ -183,7 +183,8 @@ class Robot:
             t, measured, options: as `kind` takes them.
             base: SE3 pose (7,) of the root in the world; by default the root is the world.
         Returns:
-            Residual: of trajectories in R^dof. Its loops are not compiled.
+            Residual: of trajectories in R^dof. Its loops are not compiled; those of the spline are, for half a minute
+            the first time, unless `use_kernels("reference")` says otherwise, which is as quick here.
         Raises:
             TypeError, ValueError: no such link or one that no joint moves, no such kind, or what `kind` raises.
         """
