@@ -247,7 +247,7 @@ def experiment(
         out,
         [
             Table(
-                f"Share of accelerations that is kept, poses at {frame_rate:g} Hz; noise: m/s² from 1 mm of white noise",
+                f"Share of acceleration that is kept, poses at {frame_rate:g} Hz; noise: m/s² from 1 mm, white",
                 ["", *(f"{f:g} Hz" for f in at), "noise"],
                 [
                     [name, *(f"{row[f'{f:g}']:.3f}" for f in at), f"{1e-3 * noises[name]:.2f}"]

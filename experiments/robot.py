@@ -173,6 +173,15 @@ def read_log(data: Path, log: str, robot: Robot, seed: int) -> tuple[Tensor, Ten
     return t, q + 5e-5 * normal(*q.shape, seed=seed + 1), rate + 2e-3 * normal(*q.shape, seed=seed + 2)
 
 
+def noise_of(t: Tensor, x: Tensor, count: int = 9) -> Tensor:
+    """Standard deviation of each column about cubics through so many neighbours, (dof,): no spline involved."""
+    times, values = t.unfold(0, count, 1), x.unfold(0, count, 1)  # (W, count), (W, dof, count)
+    s = (times - times.mean(-1, keepdim=True)) / (times[:, -1:] - times[:, :1])
+    basis, _ = torch.linalg.qr(s[:, :, None] ** torch.arange(4))
+    rest = values - (values @ basis) @ basis.mT
+    return (rest.square().sum(-1).mean(0) / (count - 4)).sqrt()
+
+
 def delay_of(fitted: JointFit, j: int, t: Tensor, q: Tensor, rate: Tensor) -> tuple[float, float, float]:
     """How late the recorded velocity of a joint is, s, its standard deviation, and RMS of what then remains of it."""
     spline, sigmas = fitted.trajectory, (fitted.position_sigma[j], fitted.velocity_sigma[j])  # type: ignore[index]
@@ -208,7 +217,7 @@ def recorded(
     assert fitted.velocity_sigma is not None
     alone = fit_joints(t, q, dt=fitted.spacing, position_sigma=fitted.position_sigma)
     derived = alone.trajectory.evaluate(t, derivatives=1).velocity.detach()  # type: ignore[union-attr]
-    rows = {}
+    rows, local = {}, noise_of(t, rate)
     for j, joint in enumerate(robot.joints):
         late, sure, rest = delay_of(fitted, j, t, q, rate)
         noise = float(fitted.velocity_sigma[j])
@@ -216,6 +225,7 @@ def recorded(
             "position_noise_rad": float(fitted.position_sigma[j]),
             "position_residual_rad": float(fitted.position_residual[:, j].square().mean().sqrt()),
             "velocity_noise_rad_s": noise,
+            "velocity_noise_local_cubics_rad_s": float(local[j]),
             "velocity_residual_rad_s": float(fitted.velocity_residual[:, j].square().mean().sqrt()),
             "velocity_residual_positions_only_rad_s": float((rate - derived)[:, j].square().mean().sqrt()),
             "velocity_late_s": late,
@@ -372,13 +382,14 @@ def experiment(
             Table(
                 f"{log}: {len(t)} samples, knots {fitted.spacing * 1e3:.1f} ms apart, {figures['seconds']:.2f} s; "
                 "mrad, mrad/s, ms",
-                ["joint", "position noise", "residual", "velocity noise", "residual", "from positions only",
-                 "velocities late by", "residual without delay"],
+                ["joint", "position noise", "residual", "velocity noise", "by local cubics", "residual",
+                 "from positions only", "velocities late by", "residual without delay"],
                 [
                     [
                         name, *(f"{1e3 * x[key]:.3f}" for key in (
                             "position_noise_rad", "position_residual_rad", "velocity_noise_rad_s",
-                            "velocity_residual_rad_s", "velocity_residual_positions_only_rad_s",
+                            "velocity_noise_local_cubics_rad_s", "velocity_residual_rad_s",
+                            "velocity_residual_positions_only_rad_s",
                         )),
                         f"{1e3 * x['velocity_late_s']:.2f} ± {1e3 * x['velocity_late_sigma_s']:.2f}",
                         f"{1e3 * x['velocity_residual_without_delay_rad_s']:.3f}",

@@ -73,7 +73,9 @@ def on_link(
             links_g, given_g = sensor.reverse(se3, [state for _, state, _ in chains], given, measured, g)
             joints_g = []
             for (weights, _, trace), link_g in zip(chains, links_g, strict=True):
-                _, _, weights_g = reverse(se3, steps, weights, trace, link_g.value, list(link_g.rates))
+                _, _, weights_g = reverse(
+                    se3, steps, weights, trace, link_g.value, list(link_g.rates), steps_move=False
+                )
                 sums: list[list[Scalar]] = [[0.0] * dof for _ in weights_g]
                 for row, row_g in zip(sums, weights_g, strict=True):
                     for i, f, weight_g in zip(index, factor, row_g, strict=True):
