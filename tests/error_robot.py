@@ -247,6 +247,10 @@ def encoders() -> Iterator[Case]:
         yield refused(function, name, "shape", torch.ones(3, dtype=F64), "got (3,)", "shape (4,)")
         yield refused(function, name, "nan", torch.zeros(4, dtype=F64), "got 0.0", "above zero")
     also = {"velocities": None}
+    alone = {**also, "velocity_sigma": None}
+    yield refused(
+        function, "estimate_delay", "option", True, "got none", "expected velocities with it", **alone
+    )
     yield refused(
         function, "velocity_sigma", "option", 1.0, "got none", "expected velocities with it", **also
     )

@@ -23,6 +23,8 @@ _RATIO, _LEAST_SAMPLES, _LEAST_INTERVALS = 2**0.5, 1.5, 6
 #: Weights of squared second differences of control points, in samples an interval, which bridge gaps: more where
 #: rounding asks for it.
 _SMOOTHNESS = (1e-13, 1e-10, 1e-7)
+#: At most; three are usual.
+_DELAY_STEPS = 12
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,14 @@ class JointFit:
 
     #: On R^dof, float64.
     trajectory: BSpline
-    #: Measured minus fitted, (N, dof) as given; NaN for rows not used. None without velocities.
+    #: Measured minus fitted, (N, dof) as given; NaN for what was not used. None without velocities.
     position_residual: Tensor
     velocity_residual: Tensor | None
     #: Standard deviations that positions and velocities were weighed by, (dof,).
     position_sigma: Tensor
     velocity_sigma: Tensor | None
+    #: How much later than positions velocities are, (dof,) s; None unless asked for.
+    velocity_delay: Tensor | None
     #: Knot spacing, s, and rows that were left out because of NaN.
     spacing: float
     dropped: int
@@ -44,12 +48,14 @@ class JointFit:
     notes: list[str] = field(default_factory=list)
 
 
+@dataclass
 class _Data:
-    """Of one derivative: its number, values (N, dof) and what they weigh (dof,)."""
+    """Of one derivative: its number, values (N, dof), what they weigh (dof,), and how late they are (dof,), s."""
 
-    def __init__(self, derivative: int, values: Array, sigma: Array | None):
-        self.derivative, self.values = derivative, values
-        self.sigma = np.ones(values.shape[1]) if sigma is None else sigma
+    derivative: int
+    values: Array
+    sigma: Array
+    late: Array | None = None
 
 
 def fit_joints(
@@ -61,6 +67,7 @@ def fit_joints(
     order: int = 6,
     position_sigma: Tensor | float | None = None,
     velocity_sigma: Tensor | float | None = None,
+    estimate_delay: bool = False,
 ) -> JointFit:
     """Least-squares B-spline on R^dof through the log of encoders.
 
@@ -75,6 +82,8 @@ def fit_joints(
             over joints, which expects noise that is white from sample to sample.
         order: of the spline, 4 or more, so that accelerations are continuous.
         position_sigma, velocity_sigma: standard deviations, a number or (dof,).
+        estimate_delay: find for each joint how much later its velocities are than its positions, as filters of drives
+            make them.
     Returns:
         JointFit, on the CPU in float64; `fit.Problem(result.trajectory)` takes it from there if more is known.
     Raises:
@@ -88,8 +97,9 @@ def fit_joints(
         checks.positive("dt", dt)
     dof = positions.shape[1]
     given = [_sigma("position_sigma", position_sigma, dof), _sigma("velocity_sigma", velocity_sigma, dof)]
-    if velocities is None and velocity_sigma is not None:
-        raise ValueError("velocity_sigma: expected velocities with it, got none")
+    for name, asked in (("velocity_sigma", velocity_sigma is not None), ("estimate_delay", estimate_delay)):
+        if velocities is None and asked:
+            raise ValueError(f"{name}: expected velocities with it, got none")
     columns = [positions] if velocities is None else [positions, velocities]
     usable = ~torch.stack([x.detach().isnan().any(-1) for x in columns]).any(0)
     if t.dtype != torch.int64:
@@ -117,41 +127,60 @@ def fit_joints(
     knots = Knots(times, dt, order)
     if (gaps := knots.gaps(times)) and len(gaps) > 0:
         notes.append(f"{len(gaps)} stretches of more than two knot intervals without samples were bridged")
+    late = None
+    if estimate_delay:
+        data[1].late = _delays(knots, times, data)
+        late = torch.from_numpy(data[1].late)
     points, _ = _solve(knots, times, data)
     trajectory = BSpline(torch.from_numpy(points), group=Rn(dof), order=order, **knots.options())
     residuals: list[Tensor | None] = [None, None]
-    for r, values in enumerate(numbers):
+    for r, part in enumerate(data):
         rest = torch.full((t.shape[0], dof), torch.nan, dtype=torch.float64)
-        rest[rows] = torch.from_numpy(values - _evaluate(knots, times, points, r))
+        rest[rows] = torch.from_numpy(_misses(knots, times, points, part))
         residuals[r] = rest
     sigmas = [torch.from_numpy(part.sigma) for part in data] + [None]
     assert residuals[0] is not None
     assert sigmas[0] is not None
     return JointFit(
         trajectory, residuals[0], residuals[1], sigmas[0], sigmas[1],
-        knots.seconds, int((~usable).sum()), notes,
+        late, knots.seconds, int((~usable).sum()), notes,
     )  # fmt: skip
 
 
-def _rows(knots: Knots, times: Tensor, derivative: int) -> tuple[NDArray[np.int64], Array]:
-    """First control point and weights (N, k) of a derivative per second."""
+def _rows(knots: Knots, times: Tensor, derivative: int, late: float = 0.0) -> tuple[NDArray[np.int64], Array]:
+    """First control point and weights (N, k) of a derivative per second, zeros where late ones are outside."""
+    if late:
+        start, stop = knots.t0, knots.t0 + knots.segments * knots.dt
+        shifted = times - (round(late * 1e9) if knots.nanoseconds else late)
+        inside = ((shifted >= start) & (shifted <= stop)).numpy()
+        times = shifted.clamp(start, stop)
     first, u = knots.place(times)
     matrix = np.array(derivative_matrix(blending_matrix(knots.order), derivative), dtype=np.float64)
-    return first, u[:, None] ** np.arange(knots.order) @ matrix.T / knots.seconds**derivative
+    weights = u[:, None] ** np.arange(knots.order) @ matrix.T / knots.seconds**derivative
+    return first, weights * inside[:, None] if late else weights
 
 
-def _evaluate(knots: Knots, times: Tensor, points: Array, derivative: int) -> Array:
-    first, weights = _rows(knots, times, derivative)
+def _evaluate(knots: Knots, points: Array, rows: tuple[NDArray[np.int64], Array]) -> Array:
+    first, weights = rows
     return np.einsum("nk,nkd->nd", weights, points[first[:, None] + np.arange(knots.order)])
+
+
+def _misses(knots: Knots, times: Tensor, points: Array, part: _Data) -> Array:
+    """Measured minus fitted, (N, dof), NaN where the weights are zero."""
+    if part.late is None:
+        return part.values - _evaluate(knots, points, _rows(knots, times, part.derivative))
+    rest = np.empty_like(part.values)
+    for d, late in enumerate(part.late):
+        rows = _rows(knots, times, part.derivative, float(late))
+        rest[:, d] = part.values[:, d] - _evaluate(knots, points[:, d : d + 1], rows)[:, 0]
+        rest[~rows[1].any(1), d] = np.nan
+    return rest
 
 
 def _solve(knots: Knots, times: Tensor, data: Sequence[_Data]) -> tuple[Array, Array]:
     """Control points (M, dof) and, for each joint, the weighted sum of squares that remains."""
-    rows = [_rows(knots, times, part.derivative) for part in data]
-    grams = [gram_band(weights, first, knots.count) for first, weights in rows]
-    sides = [
-        transpose_apply(weights, first, knots.count, part.values)
-        for (first, weights), part in zip(rows, data, strict=True)
+    shared = [
+        _equations(knots, times, part, 0.0, part.values) if part.late is None else None for part in data
     ]
     difference = min(2, knots.count - 1)
     bends = difference_band(knots.count, difference, max(knots.order, difference + 1))
@@ -159,18 +188,47 @@ def _solve(knots: Knots, times: Tensor, data: Sequence[_Data]) -> tuple[Array, A
     points, left = np.empty((knots.count, dof)), np.zeros(dof)
     for d in range(dof):
         # In units of the noise of the first: numbers of the matrix are counts of samples.
-        band = np.zeros((len(bends), knots.count))
-        for part, gram in zip(data, grams, strict=True):
-            band[: knots.order] += (data[0].sigma[d] / part.sigma[d]) ** 2 * gram
-        right = sum(
-            (data[0].sigma[d] / part.sigma[d]) ** 2 * side[:, d : d + 1]
-            for part, side in zip(data, sides, strict=True)
-        )
-        points[:, d] = _solve_bending(band, bends * len(times) / knots.segments, np.asarray(right))
+        band, right = np.zeros((len(bends), knots.count)), np.zeros((knots.count, 1))
+        for part, known in zip(data, shared, strict=True):
+            scale = (data[0].sigma[d] / part.sigma[d]) ** 2
+            if known is not None:
+                gram, side = known[0], known[1][:, d : d + 1]
+            else:
+                assert part.late is not None
+                gram, side = _equations(knots, times, part, float(part.late[d]), part.values[:, d : d + 1])
+            band[: knots.order] += scale * gram
+            right += scale * side
+        points[:, d] = _solve_bending(band, bends * len(times) / knots.segments, right)
     for part in data:
-        rest = part.values - _evaluate(knots, times, points, part.derivative)
-        left += (rest**2).sum(0) / part.sigma**2
+        left += np.nansum(_misses(knots, times, points, part) ** 2, axis=0) / part.sigma**2
     return points, left
+
+
+def _equations(knots: Knots, times: Tensor, part: _Data, late: float, values: Array) -> tuple[Array, Array]:
+    first, weights = _rows(knots, times, part.derivative, late)
+    return gram_band(weights, first, knots.count), transpose_apply(weights, first, knots.count, values)
+
+
+def _delays(knots: Knots, times: Tensor, data: list[_Data]) -> Array:
+    """How late velocities are, (dof,) s, by Gauss-Newton steps between solutions for the control points.
+
+    What a delay of s leaves of them is -s times the acceleration.
+    """
+    positions, velocities = data
+    late = np.zeros(positions.values.shape[1])
+    for _ in range(_DELAY_STEPS):
+        velocities.late = late
+        points, _ = _solve(knots, times, data)
+        rest = _misses(knots, times, points, velocities)
+        pull = _evaluate(knots, points, _rows(knots, times, 2))
+        there = ~np.isnan(rest)
+        power = np.where(there, pull**2, 0.0).sum(0)
+        # A joint that is not accelerated says nothing.
+        step = -np.where(there, pull * rest, 0.0).sum(0) / np.where(power > 0, power, np.inf)
+        late = np.clip(late + step, -2.0 * knots.seconds, 2.0 * knots.seconds)
+        if np.abs(step).max() < 1e-8:
+            break
+    return late
 
 
 def _solve_bending(band: Array, bends: Array, right: Array) -> Array:
@@ -208,7 +266,7 @@ def _choose(times: Tensor, data: Sequence[_Data], order: int) -> float:
 
 def _noise(times: Tensor, values: Array, order: int) -> tuple[Array, float]:
     """Standard deviation of each column about a spline of its own, (dof,), and that spline's spacing."""
-    data = [_Data(0, values, None)]
+    data = [_Data(0, values, np.ones(values.shape[1]))]
     spacing = _choose(times, data, order)
     knots = Knots(times, spacing, order)
     _, left = _solve(knots, times, data)
