@@ -6,6 +6,13 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu
+import error_imu_allan
+import error_imu_earth
+import error_imu_noise
+import error_imu_strapdown
+import error_online
+import error_robot
 import error_splines
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -18,7 +25,18 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = error_splines.CASES
+#: Files of cases, each with `CASES` and `NOT_APPLICABLE`; arguments that are accepted register themselves.
+FILES = (
+    error_online,
+    error_imu_noise,
+    error_imu_strapdown,
+    error_imu_earth,
+    error_imu_allan,
+    error_imu,
+    error_robot,
+    error_splines,
+)
+CASES = [case for file in FILES for case in file.CASES]
 
 
 def label(case: Case) -> str:
@@ -68,7 +86,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_robot.ROOTS):
         visit(root)
     return found
 
@@ -76,19 +94,28 @@ def public() -> dict[str, Callable[..., Any]]:
 #: What the library makes and hands out; nobody is meant to call these.
 RESULTS = {
     "State",
+    "AllanDeviation",
     "Kinematics",
+    "NoiseEstimate",
     "ImuReading",
+    "Increments",
+    "Navigation",
     "PoseFit",
     "Result",
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Readings",
+    "AmbientReadings",
+    *error_robot.RESULTS,
     *error_splines.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "LowPass.extra_repr": "no arguments; PyTorch calls it",
+    **error_robot.UNTRIED,
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -213,8 +240,10 @@ NOT_APPLICABLE = {
     },
 }
 
-for _category, _reasons in error_splines.NOT_APPLICABLE.items():
-    NOT_APPLICABLE[_category].update(_reasons)
+for _more in FILES:
+    for _category, _reasons in _more.NOT_APPLICABLE.items():
+        for _reason, _names in _reasons.items():  # the same reason may stand in several files
+            NOT_APPLICABLE[_category][_reason] = f"{NOT_APPLICABLE[_category].get(_reason, '')} {_names}"
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}
