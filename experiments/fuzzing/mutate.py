@@ -132,7 +132,7 @@ def mutate(data: bytes, rng: Random) -> bytes:
     """One to four kinds of damage, to the file or to what is packed in it; rarely a bomb."""
     choice = rng.random()
     if choice < 0.003:
-        return rng.choice((gzip_bomb, zip_bomb))()
+        return rng.choice((gzip_bomb, zip_bomb, lambda: text_bomb(data)))()
     if data.startswith(b"PK") and choice < 0.6:
         return _inside_zip(data, rng)
     if data.startswith(b"\x1f\x8b") and choice < 0.6:
@@ -179,6 +179,22 @@ def gzip_bomb() -> bytes:
                 stream.write(_CHUNK)
         _bombs["gzip"] = packed.getvalue()
     return _bombs["gzip"]
+
+
+def text_bomb(data: bytes) -> bytes:
+    """A megabyte that unpacks to a valid file whose last line comes until it has a quarter of a gigabyte."""
+    text = gzip.decompress(data) if data.startswith(b"\x1f\x8b") else data
+    key = f"text {hash(text)}"
+    if key not in _bombs:
+        last = text.rstrip().rpartition(b"\n")[2] + b"\n"
+        chunk = last * (len(_CHUNK) // len(last) + 1)
+        packed = io.BytesIO()
+        with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=1, mtime=0) as stream:
+            stream.write(text.rstrip() + b"\n")
+            for _ in range(_BOMB // 8 // len(chunk)):
+                stream.write(chunk)
+        _bombs[key] = packed.getvalue()
+    return _bombs[key]
 
 
 def zip_bomb() -> bytes:

@@ -12,6 +12,7 @@ from fuzzing.watch import Sample
 
 import torchspline as ts
 from torchspline import io
+from torchspline.robot import Robot
 
 _STAMP, _STEP = 1_520_530_308_189_679_351, 5_000_000
 _ROWS = 12
@@ -67,9 +68,11 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
         ),
         "load_trajectory": Reader(io.load_trajectory, _trajectories(written)),
         "read_nerfstudio": Reader(
-            lambda path: io.read_nerfstudio(path, fps=None),
+            io.read_nerfstudio,
             [written(f"{kind}.json", io.write_nerfstudio, record, kind) for kind in ("camera_path", "transforms")],
         ),
+        "read_bvh": Reader(io.read_bvh, [Sample("walk.bvh", _BVH), packed(Sample("walk.bvh", _BVH))]),
+        "Robot.from_urdf": Reader(Robot.from_urdf, [Sample("arm.urdf", _URDF)]),
     }
     return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
 
@@ -142,4 +145,56 @@ _KALIBR = b"""imu0:
   rostopic: /imu0
   time_offset: 0.0
   update_rate: 200.0
+"""
+
+_BVH = b"""HIERARCHY
+ROOT Hips
+{
+  OFFSET 0.0 0.0 0.0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Spine
+  {
+    OFFSET 0.0 10.5 0.0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0.0 20.0 0.0
+    }
+  }
+}
+MOTION
+Frames: 3
+Frame Time: 0.008333
+1.0 90.5 3.0 10.0 -20.0 30.0 1.0 2.0 3.0
+1.1 90.4 3.1 10.5 -20.5 30.5 1.5 2.5 3.5
+1.2 90.3 3.2 11.0 -21.0 31.0 2.0 3.0 4.0
+"""
+
+_URDF = b"""<?xml version="1.0"?>
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper"/>
+  <link name="lower"/>
+  <link name="hand"/>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/>
+    <child link="upper"/>
+    <origin xyz="0 0 0.3" rpy="0 0.1 0"/>
+    <axis xyz="0 0 1"/>
+    <limit lower="-1.5" upper="1.5" velocity="2.0" effort="10"/>
+  </joint>
+  <joint name="elbow" type="prismatic">
+    <parent link="upper"/>
+    <child link="lower"/>
+    <origin xyz="0.4 0 0" rpy="0 0 0"/>
+    <axis xyz="1 0 0"/>
+    <limit lower="0" upper="0.5" velocity="1.0" effort="10"/>
+  </joint>
+  <joint name="wrist" type="continuous">
+    <parent link="lower"/>
+    <child link="hand"/>
+    <axis xyz="0 1 0"/>
+    <mimic joint="elbow" multiplier="2.0" offset="0.1"/>
+  </joint>
+</robot>
 """

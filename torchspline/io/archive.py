@@ -4,6 +4,7 @@ import gzip
 import io
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -27,6 +28,11 @@ _DAMAGED = (
     RuntimeError,
     ValueError,
     OverflowError,
+    # Of the parser of headers, which are written as Python:
+    tokenize.TokenError,
+    SyntaxError,
+    TypeError,
+    LookupError,
 )
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 

@@ -1,5 +1,7 @@
 """ROS bags, of ROS 1 and 2 (MCAP and SQLite), through the package rosbags: no ROS needed."""
 
+import io
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
@@ -146,6 +148,24 @@ def _columns(rows: list[tuple[int, tuple[float, ...]]], width: int) -> tuple[Ten
     return stamps, torch.tensor([x for _, x in rows], dtype=torch.float64).reshape(-1, width)
 
 
+class _BoundedReader(io.BufferedReader):
+    """Reads no more than there is: lengths in damaged files would reserve memory of their size."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > io.DEFAULT_BUFFER_SIZE:
+            size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
+        return super().read(size)
+
+
+class _BoundedPath(type(Path())):  # type: ignore[misc]
+    """A path whose files are opened for bounded reading."""
+
+    def open(self, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+        if mode == "rb" and not arguments and not options:
+            return _BoundedReader(io.FileIO(str(self)))
+        return super().open(mode, *arguments, **options)
+
+
 @contextmanager
 def _messages(path: Path, topic: str | None, kinds: tuple[str, ...], what: str) -> Iterator[Any]:
     """Iterates over the messages of the chosen topic, with their kind."""
@@ -157,7 +177,7 @@ def _messages(path: Path, topic: str | None, kinds: tuple[str, ...], what: str) 
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     chosen = ""
     try:
-        with highlevel.AnyReader([path], default_typestore=store) as reader:
+        with highlevel.AnyReader([_BoundedPath(path)], default_typestore=store) as reader:
             topics = {c.topic: c.msgtype for c in reader.connections}
             fitting = [name for name, kind in topics.items() if kind in kinds and topic in (None, name)]
             if len(fitting) == 1:
