@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from common import Table, run, save, show
+from fuzzing.mutate import prepare
 from fuzzing.readers import readers
 from fuzzing.watch import Outcome, watch
 from matplotlib.figure import Figure
@@ -50,6 +51,7 @@ def experiment(
         seed: of the damage.
     """
     torch.set_num_threads(1)
+    prepare()
     outcomes: dict[str, Outcome] = {}
     for name, (read, samples) in readers(seed).items():
         if only and not any(word in name for word in only):

@@ -20,7 +20,7 @@ TOKENS = (
 )  # fmt: skip
 _NUMBER = re.compile(rb"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 #: Sizes of what bombs unpack to, bytes: more than a reader may use.
-_BOMB = 2**31
+_BOMB = 5 * 2**28
 _CHUNK = bytes(2**22)
 
 Random = random.Random
@@ -136,9 +136,9 @@ def mutate(data: bytes, rng: Random) -> bytes:
     if data.startswith(b"PK") and choice < 0.6:
         return _inside_zip(data, rng)
     if data.startswith(b"\x1f\x8b") and choice < 0.6:
-        return gzip.compress(_damaged(gzip.decompress(data), rng), 1)
+        return gzip.compress(_damaged(gzip.decompress(data), rng), 1, mtime=0)
     damaged = _damaged(data, rng)
-    return gzip.compress(damaged, 1) if choice > 0.97 else damaged
+    return gzip.compress(damaged, 1, mtime=0) if choice > 0.97 else damaged
 
 
 def _damaged(data: bytes, rng: Random) -> bytes:
@@ -163,18 +163,26 @@ def _inside_zip(data: bytes, rng: Random) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for name, content in members:
-            archive.writestr(name, content)
+            info = zipfile.ZipInfo(name)  # with a date that is always the same
+            info.compress_type = archive.compression
+            archive.writestr(info, content)
     return packed.getvalue()
 
 
 _bombs: dict[str, bytes] = {}
 
 
+def prepare() -> None:
+    """Makes the bombs: processes that are forked later need not."""
+    gzip_bomb()
+    zip_bomb()
+
+
 def gzip_bomb() -> bytes:
-    """Two megabytes that unpack to two gigabytes of zeros."""
+    """Some megabytes that unpack to more than a gigabyte of zeros."""
     if "gzip" not in _bombs:
         packed = io.BytesIO()
-        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as stream:
+        with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=1, mtime=0) as stream:
             for _ in range(_BOMB // len(_CHUNK)):
                 stream.write(_CHUNK)
         _bombs["gzip"] = packed.getvalue()
@@ -191,17 +199,17 @@ def text_bomb(data: bytes) -> bytes:
         packed = io.BytesIO()
         with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=1, mtime=0) as stream:
             stream.write(text.rstrip() + b"\n")
-            for _ in range(_BOMB // 8 // len(chunk)):
+            for _ in range(_BOMB // 5 // len(chunk)):
                 stream.write(chunk)
         _bombs[key] = packed.getvalue()
     return _bombs[key]
 
 
 def zip_bomb() -> bytes:
-    """An npz archive whose one array unpacks to two gigabytes."""
+    """An npz archive whose arrays unpack to more than a gigabyte."""
     if "zip" not in _bombs:
         packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name in ("header.npy", "t_ns.npy"):
                 with archive.open(name, "w", force_zip64=True) as stream:
                     for _ in range(_BOMB // 2 // len(_CHUNK)):

@@ -2,8 +2,10 @@
 
 import json
 import multiprocessing
+import os
 import random
 import resource
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -113,6 +115,7 @@ def _work(
     report: Path,
 ) -> None:
     """In the process of its own: reads from `start` on, and reports every now and then."""
+    sys.stderr = open(os.devnull, "w")  # noqa: SIM115  # parsers of other packages talk
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     size = pages * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + memory_limit, size + memory_limit))
