@@ -60,6 +60,7 @@ def experiment(
             outcomes[name] = watch(
                 name, read, samples, Path(folder), count, seed, time_limit, memory_limit_mib * 2**20
             )
+        print(f"{name}: {len(outcomes[name].findings)} findings", file=sys.stderr)
     rows = [
         (
             name,

@@ -29,7 +29,6 @@ records.save_trajectory(f"{FOLDER.name}/good.npz", SPLINE)
 records.write_nerfstudio(f"{FOLDER.name}/good.json", POSES)
 
 
-
 def write_rosbag(path: Any, records: Any) -> None:
     """Into a new folder; where the package is not installed, that is said after the arguments were looked at."""
     if path == f"{FOLDER.name}/bag":
@@ -79,14 +78,18 @@ def cases() -> Iterator[Case]:
     for function in _WRITE.split():
         yield refused(function, "path", "option", nowhere, "does not exist", "make it first", named=nowhere)
     text = file("words", "words.npz")
-    yield refused("load_trajectory", "path", "option", text, "got a damaged one", "an npz archive", named=text)
+    yield refused(
+        "load_trajectory", "path", "option", text, "got a damaged one", "an npz archive", named=text
+    )
     yield refused("read_nerfstudio", "path", "option", text, "Expecting value", "expected JSON", named=text)
     for bad in ("a", True, 1j):
         yield refused("read_nerfstudio", "fps", "type", bad, f"got {type(bad).__name__}", "expected a number")
     for bad in (NAN, 0.0, -1.0):
         yield refused("read_nerfstudio", "fps", "option", bad, f"got {bad}", "above zero")
     for bad in (None, POSES, SimpleNamespace()):
-        yield refused("save_trajectory", "trajectory", "type", bad, f"got {type(bad).__name__}", "one of BSpline")
+        yield refused(
+            "save_trajectory", "trajectory", "type", bad, f"got {type(bad).__name__}", "one of BSpline"
+        )
     yield from of_nerfstudio()
     yield from of_ros()
 
@@ -102,7 +105,13 @@ def of_nerfstudio() -> Iterator[Case]:
     yield refused(function, "record", "nan", lost, "got nan at index (1, 2)", "finite")
     uneven = {**POSE_COLUMNS, "time_ns": POSES.time_ns**2}
     yield refused(
-        function, "record", "time", records.PoseRecord(**uneven), "off by", "evenly spaced", kind="camera_path"
+        function,
+        "record",
+        "time",
+        records.PoseRecord(**uneven),
+        "off by",
+        "evenly spaced",
+        kind="camera_path",
     )
     for bad in ("video", None):
         yield refused(function, "kind", "option", bad, f"got {bad!r}", "'camera_path', 'transforms'")
@@ -119,7 +128,9 @@ def of_ros() -> Iterator[Case]:
     for bad in (None, POSES, [POSES]):
         yield refused(function, "records", "type", bad, f"got {type(bad).__name__}", "a mapping of topics")
     yield refused(function, "records", "type", {5: POSES}, "got int", "topics that are words")
-    yield refused(function, "records", "type", {"/a": SPLINE}, "got SplitBSpline", "a PoseRecord or", "records")
+    yield refused(
+        function, "records", "type", {"/a": SPLINE}, "got SplitBSpline", "a PoseRecord or", "records"
+    )
     yield refused(function, "records", "count", {}, "got none", "at least one record")
     empty = {"/a": POSES.window(1, 0)}
     yield refused(function, "records", "count", empty, "got an empty", "expected rows", "records")

@@ -65,7 +65,9 @@ def test_gradients_and_jacobians_are_those_of_its_numbers(group):
     for function in functions:
         arguments = [a.clone().requires_grad_() for a in (x, y)]
         assert torch.autograd.gradcheck(function, arguments)
-    by_numbers = torch.func.jacfwd(lambda d: group.log(group.compose(group.exp(x + d), group.inverse(group.exp(x)))))
+    by_numbers = torch.func.jacfwd(
+        lambda d: group.log(group.compose(group.exp(x + d), group.inverse(group.exp(x))))
+    )
     torch.testing.assert_close(group.left_jacobian(x), by_numbers(torch.zeros(3, dtype=F64)))
 
 

@@ -1,4 +1,4 @@
-"""The watch over readers: it sees what readers must not do. The readers themselves: experiments/fuzz_readers.py --smoke."""
+"""The watch over readers sees what they must not do. What they do: experiments/fuzz_readers.py --smoke."""
 
 import gzip
 import random
@@ -58,7 +58,10 @@ def test_a_reader_that_misbehaves_is_found_out(fuzzing, tmp_path):
 
 def test_damage_is_damage_and_the_same_again(fuzzing):
     watch, mutate = fuzzing
-    samples = [watch.Sample("x.txt.gz", gzip.compress(b"1.5 2 3\n" * 20, mtime=0)), watch.Sample("y", b"a: 1\n" * 20)]
+    samples = [
+        watch.Sample("x.txt.gz", gzip.compress(b"1.5 2 3\n" * 20, mtime=0)),
+        watch.Sample("y", b"a: 1\n" * 20),
+    ]
     inputs = [watch.damaged(samples, 3, "reader", i) for i in range(200)]
     assert inputs == [watch.damaged(samples, 3, "reader", i) for i in range(200)]
     assert inputs != [watch.damaged(samples, 4, "reader", i) for i in range(200)]

@@ -17,7 +17,23 @@ EPS = torch.finfo(F64).eps
 #: Lengths on every scale, and those where something changes: subnormal, where squares underflow, series end, pi.
 lengths = st.one_of(
     st.sampled_from(
-        [0.0, 5e-324, 1e-310, 1e-200, 1e-162, 1.5e-154, 1e-16, 1e-8, 1.2e-4, 1e-3, 0.1, 1.0, math.pi / 2, 3.0, 3.14]
+        [
+            0.0,
+            5e-324,
+            1e-310,
+            1e-200,
+            1e-162,
+            1.5e-154,
+            1e-16,
+            1e-8,
+            1.2e-4,
+            1e-3,
+            0.1,
+            1.0,
+            math.pi / 2,
+            3.0,
+            3.14,
+        ]
     ),
     st.floats(-300.0, 0.0).map(lambda e: 10.0**e),
     st.floats(0.0, 3.14),
@@ -32,7 +48,9 @@ def tangents(draw, name):
     parts = []
     for factor in name.split("x"):
         rotation = {"SO3": 3, "SE3": 3, "DualQuaternion": 3, "SO2": 1, "SE2": 1}.get(factor, 0)
-        place = {"SE3": 3, "DualQuaternion": 3, "SE2": 2}.get(factor, 0) or (0 if rotation else int(factor[1:]))
+        place = {"SE3": 3, "DualQuaternion": 3, "SE2": 2}.get(factor, 0) or (
+            0 if rotation else int(factor[1:])
+        )
         parts += [draw(distances) for _ in range(place)]
         if rotation:
             direction = torch.tensor([draw(coordinates) for _ in range(rotation)], dtype=F64)
@@ -46,7 +64,9 @@ def close(a, b, tolerance=1e-13, scale=1.0):
     assert torch.isfinite(a).all()
     assert torch.isfinite(b).all()
     error = (a - b).abs().max().item()
-    assert error <= tolerance * scale, f"{error:.2e} apart, {tolerance * scale:.1e} allowed: {a.tolist()}, {b.tolist()}"
+    assert error <= tolerance * scale, (
+        f"{error:.2e} apart, {tolerance * scale:.1e} allowed: {a.tolist()}, {b.tolist()}"
+    )
 
 
 def size(*tensors):
@@ -162,7 +182,9 @@ def test_gradients_are_finite_at_the_edges(name):
         assert torch.isfinite(found).all()
         for start, stop in group.arithmetic.unit_blocks:  # nothing depends on the length
             along = (found[start:stop] * point.detach()[start:stop]).sum()
-            assert name == "DualQuaternion" or along.abs() <= 1e-10 * (1 + found.abs().max()) * size(x.detach())
+            assert name == "DualQuaternion" or along.abs() <= 1e-10 * (1 + found.abs().max()) * size(
+                x.detach()
+            )
 
     check()
 

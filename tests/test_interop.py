@@ -55,17 +55,24 @@ def hermite(**options):
 KNOTS = torch.tensor([0.0] * 3 + [0.1, 0.4, 0.7] + [1.1] * 3, dtype=F64)
 TRAJECTORIES = {
     "BSpline": lambda: ts.BSpline(points(7), group=ts.SE3, order=5, dt=0.1, t0=math.pi, extrapolate="clamp"),
-    "float32": lambda: ts.BSpline(points(5, ts.SO3, F32), group=ts.SO3, dt=0.1, learnable=False, validate=False),
+    "float32": lambda: ts.BSpline(
+        points(5, ts.SO3, F32), group=ts.SO3, dt=0.1, learnable=False, validate=False
+    ),
     "learnt times": lambda: ts.BSpline(
         points(5), group=ts.SE3, dt=nn.Parameter(torch.tensor(0.1, dtype=F64)), t0=1e9 / 3
     ),
     "nanoseconds": lambda: ts.BSpline(
-        points(6, ts.product(ts.Rn(2), ts.SO2)), group=ts.product(ts.Rn(2), ts.SO2), dt_ns=10**7 + 1, t0_ns=STAMP
+        points(6, ts.product(ts.Rn(2), ts.SO2)),
+        group=ts.product(ts.Rn(2), ts.SO2),
+        dt_ns=10**7 + 1,
+        t0_ns=STAMP,
     ),
     "batch": lambda: ts.SplitBSpline(points(12).reshape(2, 6, 7), dt=0.25),
     "NonuniformBSpline": lambda: ts.NonuniformBSpline(points(6, ts.SE2), group=ts.SE2, order=3, knots=KNOTS),
     "HermiteSpline": lambda: hermite(coordinates="logarithm", frame="world", extrapolate="linear"),
-    "SQUAD": lambda: ts.KeyframeSpline("SQUAD", points(6, ts.SO3), KNOTS[2:8] + torch.arange(6) * 0.1, way="signs"),
+    "SQUAD": lambda: ts.KeyframeSpline(
+        "SQUAD", points(6, ts.SO3), KNOTS[2:8] + torch.arange(6) * 0.1, way="signs"
+    ),
     "options": lambda: ts.KeyframeSpline(
         "composite_bezier", points(6, ts.SO3), torch.arange(6.0, dtype=F64), group=ts.SO3, ends="clamped"
     ),
@@ -105,7 +112,17 @@ def test_trajectories_come_back_bit_for_bit(tmp_path, name):
         assert x.dtype == state[key].dtype
         assert torch.equal(x, state[key])
     assert [k for k, _ in found.named_parameters()] == [k for k, _ in made.named_parameters()]
-    for key in ("order", "extrapolate", "validate", "way", "method", "coordinates", "frame", "dt_ns", "t0_ns"):
+    for key in (
+        "order",
+        "extrapolate",
+        "validate",
+        "way",
+        "method",
+        "coordinates",
+        "frame",
+        "dt_ns",
+        "t0_ns",
+    ):
         assert getattr(found, key, None) == getattr(made, key, None)
     t = times_of(made)
     for a, b in zip(found.evaluate(t), made.evaluate(t), strict=True):
@@ -163,7 +180,9 @@ def test_headers_that_are_wrong(tmp_path, changes, message):
 def test_archives_that_are_no_trajectory(tmp_path):
     path = tmp_path / "x.npz"
     np.savez(path, control_points=np.zeros(3))
-    with pytest.raises(ValueError, match=r"x.npz: .*no header of a torchspline trajectory, only control_points"):
+    with pytest.raises(
+        ValueError, match=r"x.npz: .*no header of a torchspline trajectory, only control_points"
+    ):
         load_trajectory(path)
     np.savez(path, header=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match=r"x.npz: expected an npz archive of numbers, got .*object"):
@@ -190,7 +209,7 @@ def test_a_file_keeps_its_name_and_needs_a_known_family(tmp_path):
     class Mine(ts.BSpline):
         pass
 
-    with pytest.raises(TypeError, match="trajectory: expected one of BSpline, .*, got Mine"):
+    with pytest.raises(TypeError, match=r"trajectory: expected one of BSpline, .*, got Mine"):
         save_trajectory(tmp_path / "x", Mine(points(4), group=ts.SE3, dt=0.1))
 
 
@@ -216,9 +235,13 @@ def test_nerfstudio_round_trip(tmp_path, kind, name):
 
 def test_nerfstudio_files_hold_cameras_as_nerfstudio_means_them(tmp_path):
     """A camera at (1, 2, 3) that looks along the world's +x with the world's z up."""
-    looking = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).as_quat()  # columns: right, down, forward
+    looking = Rotation.from_matrix(
+        [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    ).as_quat()  # columns: right, down, forward
     record = PoseRecord(
-        torch.tensor([0]), torch.tensor([[1.0, 2.0, 3.0]], dtype=F64), torch.from_numpy(looking[None, [3, 0, 1, 2]])
+        torch.tensor([0]),
+        torch.tensor([[1.0, 2.0, 3.0]], dtype=F64),
+        torch.from_numpy(looking[None, [3, 0, 1, 2]]),
     )
     write_nerfstudio(tmp_path / "t.json", record, "transforms", field_of_view=90.0, resolution=(640, 480))
     content = json.loads((tmp_path / "t.json").read_text())
@@ -233,10 +256,16 @@ def test_nerfstudio_files_hold_cameras_as_nerfstudio_means_them(tmp_path):
     content = json.loads((tmp_path / "c.json").read_text())
     (camera,) = content["camera_path"]
     np.testing.assert_allclose(np.reshape(camera["camera_to_world"], (4, 4))[:3].T, [right, up, back, place])
-    assert (camera["fov"], camera["aspect"], content["render_width"], content["fps"]) == (90.0, 640 / 480, 640, 1.0)
+    assert (camera["fov"], camera["aspect"], content["render_width"], content["fps"]) == (
+        90.0,
+        640 / 480,
+        640,
+        1.0,
+    )
 
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+FLAT = [x for row in IDENTITY for x in row]
 
 
 @pytest.mark.parametrize(
@@ -247,14 +276,29 @@ IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ({"frames": []}, "expected a list of frames or camera_path that is not empty"),
         ({"frames": [3]}, r"frames\[0\]: expected transform_matrix in it, got 3"),
         ({"frames": [{"transform_matrix": IDENTITY}]}, "expected a time in every frame.*pass fps="),
-        ({"frames": [{"transform_matrix": [1], "time": 0}]}, r"frames\[0\].transform_matrix: expected 4 x 4 numbers"),
-        ({"frames": [{"transform_matrix": IDENTITY, "time": None}]}, r"frames\[0\].time: expected a finite number"),
-        ({"frames": [{"transform_matrix": [[2, 0, 0, 0], *IDENTITY[1:]], "time": 0}]}, r"expected a rotation"),
-        ({"frames": [{"transform_matrix": [[-1, 0, 0, 0], *IDENTITY[1:]], "time": 0}]}, r"expected a rotation"),
-        ({"frames": [{"transform_matrix": [[math.nan] * 4, *IDENTITY[1:]], "time": 0}]}, "expected finite numbers"),
+        (
+            {"frames": [{"transform_matrix": [1], "time": 0}]},
+            r"frames\[0\].transform_matrix: expected 4 x 4 numbers",
+        ),
+        (
+            {"frames": [{"transform_matrix": IDENTITY, "time": None}]},
+            r"frames\[0\].time: expected a finite number",
+        ),
+        (
+            {"frames": [{"transform_matrix": [[2, 0, 0, 0], *IDENTITY[1:]], "time": 0}]},
+            r"expected a rotation",
+        ),
+        (
+            {"frames": [{"transform_matrix": [[-1, 0, 0, 0], *IDENTITY[1:]], "time": 0}]},
+            r"expected a rotation",
+        ),
+        (
+            {"frames": [{"transform_matrix": [[math.nan] * 4, *IDENTITY[1:]], "time": 0}]},
+            "expected finite numbers",
+        ),
         ({"frames": [{"transform_matrix": IDENTITY, "time": 1e300}]}, "within the range of int64"),
-        ({"fps": 0, "camera_path": [{"camera_to_world": sum(IDENTITY, [])}]}, "fps: expected a number above zero"),
-        ({"camera_path": [{"camera_to_world": sum(IDENTITY, [])}]}, "fps: expected a finite number, got None"),
+        ({"fps": 0, "camera_path": [{"camera_to_world": FLAT}]}, "fps: expected a number above zero"),
+        ({"camera_path": [{"camera_to_world": FLAT}]}, "fps: expected a finite number, got None"),
     ],
 )
 def test_nerfstudio_files_that_are_wrong(tmp_path, content, message):
@@ -361,7 +405,9 @@ def test_tum_files_are_what_evo_reads(tmp_path):
     lines = [x for x in (tmp_path / "poses.txt").read_text().split("\n") if x and not x.startswith("#")]
     rows = np.array([[float(x) for x in line.split(" ")] for line in lines])
     assert rows.shape == (6, 8)
-    np.testing.assert_allclose(rows[:, 0], record.time_ns.numpy() / 1e9, rtol=0, atol=3e-7)  # a float64's worth
+    np.testing.assert_allclose(
+        rows[:, 0], record.time_ns.numpy() / 1e9, rtol=0, atol=3e-7
+    )  # a float64's worth
     np.testing.assert_array_equal(rows[:, 4:], record.rotation[:, [1, 2, 3, 0]].numpy())
     file_interface = pytest.importorskip("evo.tools.file_interface")
     found = file_interface.read_tum_trajectory_file(tmp_path / "poses.txt")

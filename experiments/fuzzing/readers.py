@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from fuzzing.watch import Sample
 
 import torchspline as ts
+from fuzzing.watch import Sample
 from torchspline import io
 from torchspline.robot import Robot
 
@@ -54,10 +54,10 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
         "read_poses, TUM": Reader(io.read_poses, [tum, packed(tum)]),
         "read_poses, EuRoC": Reader(io.read_poses, [euroc, packed(euroc)]),
         "read_imu, EuRoC": Reader(io.read_imu, [samples, packed(samples)]),
-        "read_poses, KITTI": Reader(
-            io.read_poses, [Sample("00_gt.txt", kitti, (("00_times.txt", stamps),))]
+        "read_poses, KITTI": Reader(io.read_poses, [Sample("00_gt.txt", kitti, (("00_times.txt", stamps),))]),
+        "read_poses, KITTI stamps": Reader(
+            _kitti_stamps, [Sample("stamps.txt", stamps, (("gt.txt", kitti),))]
         ),
-        "read_poses, KITTI stamps": Reader(_kitti_stamps, [Sample("stamps.txt", stamps, (("gt.txt", kitti),))]),
         "read_imu_parameters": Reader(
             io.read_imu_parameters,
             [
@@ -69,7 +69,10 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
         "load_trajectory": Reader(io.load_trajectory, _trajectories(written)),
         "read_nerfstudio": Reader(
             io.read_nerfstudio,
-            [written(f"{kind}.json", io.write_nerfstudio, record, kind) for kind in ("camera_path", "transforms")],
+            [
+                written(f"{kind}.json", io.write_nerfstudio, record, kind)
+                for kind in ("camera_path", "transforms")
+            ],
         ),
         "read_bvh": Reader(io.read_bvh, [Sample("walk.bvh", _BVH), packed(Sample("walk.bvh", _BVH))]),
         "Robot.from_urdf": Reader(Robot.from_urdf, [Sample("arm.urdf", _URDF)]),
@@ -90,7 +93,9 @@ def _trajectories(written: Callable[..., Sample]) -> list[Sample]:
         "mounted": ts.SplitBSpline(points, dt_ns=10**8, t0_ns=_STAMP).mounted(points[0]),
         "hermite": ts.HermiteSpline(points, *rates, group=ts.SE3, times=times),
         "keyframes": ts.KeyframeSpline("SPLIT", points, times),
-        "knots": ts.NonuniformBSpline(points, group=ts.SE3, order=3, knots=torch.arange(9.0, dtype=torch.float64)),
+        "knots": ts.NonuniformBSpline(
+            points, group=ts.SE3, order=3, knots=torch.arange(9.0, dtype=torch.float64)
+        ),
     }
     return [written(f"{name}.npz", io.save_trajectory, x) for name, x in families.items()]
 

@@ -28,7 +28,7 @@ class Sample(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """What a reader must not do: "crash", "hang", "memory", or "message" (of many lines, or without the file's name)."""
+    """What a reader must not do: "crash", "hang", "memory", or "message" (many lines, or none that names the file)."""
 
     kind: str
     index: int

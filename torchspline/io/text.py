@@ -90,6 +90,7 @@ class Table:
 
     def error(self, row: int, got: str, expected: str) -> ValueError:
         """A `ValueError` that names the file, the line, what came and what was expected."""
+        got = got if len(got) <= 120 else f"{got[:117]}..."
         return ValueError(f"{self.path}, line {self.lines[row]}: expected {expected}, got {got}")
 
     def excerpt(self, row: int) -> str:
