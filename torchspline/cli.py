@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `torchspline imu`, `torchspline kernels show`."""
+"""The command line: `torchspline demo`, `torchspline imu`, `torchspline generate`, `torchspline kernels show`."""
 
 import json
 import math
@@ -13,6 +13,7 @@ from rich.table import Table
 from torch import Tensor
 
 from torchspline.fit import PoseFit, fit_poses
+from torchspline.generate.command import generate
 from torchspline.groups import SO3, Group
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses, write_imu, write_poses
@@ -340,8 +341,11 @@ def main() -> None:
     """Entry point of the `torchspline` command."""
     from jsonargparse import CLI
 
+    commands = {"demo": demo, "imu": imu, "generate": generate, "kernels": {"show": show}}
+    # A truth value takes a word of its own, but nobody types one after --json.
+    arguments = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:
-        status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
+        status = CLI(commands, args=arguments, prog="torchspline")
     except (TypeError, ValueError, OSError, MemoryError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2
