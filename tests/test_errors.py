@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu_noise
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -18,7 +19,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = error_online.CASES
+CASES = [*error_online.CASES, *error_imu_noise.CASES]
 
 
 def label(case: Case) -> str:
@@ -212,8 +213,9 @@ NOT_APPLICABLE = {
     },
 }
 
-for _category, _reasons in error_online.NOT_APPLICABLE.items():
-    NOT_APPLICABLE[_category].update(_reasons)
+for _more in (error_online, error_imu_noise):
+    for _category, _reasons in _more.NOT_APPLICABLE.items():
+        NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}
