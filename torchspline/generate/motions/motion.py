@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchspline.generate.distributions import Distribution, Parameter
 from torchspline.groups import R3, SO3
+from torchspline.imu.scan import Element, prefix
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines.bspline import bspline
 
@@ -94,16 +95,15 @@ def _derivative_rms(rate: int) -> float:
 def turned(rates: Tensor, tau: Tensor, start: Tensor) -> Tensor:
     """Rotations (B, M, 4) of a body that starts at `start` (B, 4) and turns at `rates` (B, M, 3) rad/s, body frame.
 
-    Trapezoids over the steps of `tau`, multiplied in log2(M) rounds.
+    Trapezoids over the steps of `tau`.
     """
     middle = 0.5 * (rates[:, 1:] + rates[:, :-1]) * tau.diff(dim=1)[..., None]
-    rotations = torch.cat([start[:, None], SO3.exp(middle, validate=False)], dim=1)
-    reach = 1
-    while reach < rotations.shape[1]:
-        joined = SO3.compose(rotations[:, :-reach], rotations[:, reach:], validate=False)
-        rotations = torch.cat([rotations[:, :reach], joined], dim=1)
-        reach *= 2
-    return SO3.normalize(rotations, validate=False)
+    steps = torch.cat([start[:, None], SO3.exp(middle, validate=False)], dim=1)
+
+    def combine(earlier: Element, later: Element) -> Element:
+        return (SO3.compose(earlier[0], later[0], validate=False),)
+
+    return SO3.normalize(prefix(combine, (steps,))[0], validate=False)
 
 
 def differences(x: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
