@@ -154,9 +154,7 @@ def distribution_of(path: str, value: Any, parameter: Parameter) -> Distribution
     Raises:
         TypeError, ValueError: with the key, what was expected and what came.
     """
-    if isinstance(value, Distribution):
-        found = value
-    elif isinstance(value, Mapping):
+    if isinstance(value, Mapping):
         if len(value) != 1 or (kind := next(iter(value))) not in _KINDS:
             raise ValueError(
                 f"{path}: expected a number or one distribution out of {', '.join(_KINDS)}, got {dict(value)!r}"
@@ -186,20 +184,14 @@ def distribution_of(path: str, value: Any, parameter: Parameter) -> Distribution
 
 
 def number_at(path: str, value: Any) -> float:
-    """A finite number in a configuration."""
+    """A finite number in a configuration; YAML 1.1 reads `1e-3`, without a point, as text."""
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            pass
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        hint = (
-            " (YAML reads 1e-3 as text: write 1.0e-3)" if isinstance(value, str) and _is_number(value) else ""
-        )
-        raise TypeError(f"{path}: expected a number, got {value!r}{hint}")
+        raise TypeError(f"{path}: expected a number, got {value!r}")
     if not math.isfinite(value):
         raise ValueError(f"{path}: expected a finite number, got {value}")
     return float(value)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

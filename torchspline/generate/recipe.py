@@ -1,6 +1,5 @@
 """What a data set is made of: kinds of motion and qualities of sensors, and what they are drawn from."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
@@ -104,8 +103,8 @@ class Recipe:
         return distribution_of("rest", self.rest, REST)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as they stand in a file."""
-        return json.loads(json.dumps({name: getattr(self, name) for name in self.__dataclass_fields__}))
+        """Plain values, as they stand in a file; the same for recipes that say the same."""
+        return {name: _plain(getattr(self, name)) for name in self.__dataclass_fields__}
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "Recipe":
@@ -131,6 +130,20 @@ class Recipe:
             return cls(**given)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{path}: {error}") from None
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as floats, also those that YAML took for text (see `number_at`)."""
+    if isinstance(value, Mapping):
+        return {name: _plain(x) for name, x in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(x) for x in value]
+    if value is None:
+        return {}
+    try:
+        return float(value)
+    except ValueError:
+        return value
 
 
 def _mapping(path: str, value: Any, known: Mapping[str, Any] | None = None) -> dict[str, Any]:
