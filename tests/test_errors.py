@@ -6,7 +6,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu
+import error_imu_earth
 import error_imu_noise
+import error_imu_strapdown
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -19,7 +22,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = [*error_online.CASES, *error_imu_noise.CASES]
+MORE = (error_online, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown)
+CASES = [case for more in MORE for case in more.CASES]
 
 
 def label(case: Case) -> str:
@@ -79,16 +83,21 @@ RESULTS = {
     "State",
     "Kinematics",
     "ImuReading",
+    "Increments",
+    "Navigation",
     "PoseFit",
     "Result",
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Readings",
+    "AmbientReadings",
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "LowPass.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -213,7 +222,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, error_imu_noise):
+for _more in MORE:
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

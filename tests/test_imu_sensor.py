@@ -406,3 +406,23 @@ def test_the_loop_equals_the_reference(kind):
         assert torch.allclose(exposure(trajectory, t, scene), expected, rtol=0, atol=1e-12)
         one = Scene(*(x[0] for x in scene))
         assert torch.allclose(exposure(trajectory, t, one), shared, rtol=0, atol=1e-12)
+
+
+# ---------------------------------------------------------------------- increments
+
+
+@pytest.mark.parametrize("averaging", [0, 3])
+def test_increments_are_those_of_the_motion(averaging):
+    trajectory = spline(BATCH, order=6, count=20)
+    mount, errors = parameters()["T_body_imu"], []
+    sensor = imu.Imu(T_body_imu=mount, averaging=averaging)
+    for count in (40, 80):
+        t = torch.linspace(0.0, 1.0, count + 1, dtype=F64)
+        found = sensor.increments(sensor(trajectory, t), t)
+        exact = imu.increments(trajectory, t, T_body_imu=mount)
+        # The first readings of an IMU that averages belong to the interval before, their neighbours to the edges.
+        errors.append([(a - b)[:, 2:-2].abs().max().item() for a, b in zip(found, exact, strict=True)])
+        sizes = [x.abs().max().item() for x in exact]
+    for coarse, fine, size in zip(*errors, sizes, strict=True):
+        assert fine < 1e-2 * size
+        assert coarse / fine > 6.0  # of third order at least

@@ -3,15 +3,19 @@
 import pytest
 import torch
 
-from torchspline import use_kernels
-from torchspline.imu.scan import linear_recurrence, prefix
+from torchspline import SO3, use_kernels
+from torchspline.imu.scan import linear_recurrence, prefix, rotation_products
 
 F32, F64 = torch.float32, torch.float64
 MODES = pytest.mark.parametrize("mode", ["reference", "auto"])
 
 
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
 def numbers(*shape, seed=0):
-    return torch.randn(shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(shape, dtype=F64, generator=seeded(seed))
 
 
 def one_by_one(factors, x):
@@ -94,3 +98,42 @@ def test_transforms_of_linear_recurrence():
         _, rate = torch.func.jvp(lambda f: linear_recurrence(f, x), (factors,), (torch.ones_like(factors),))
         (back,) = torch.autograd.functional.vjp(lambda f: linear_recurrence(f, x), factors, x)[1:]
         assert torch.allclose((rate * x).sum(), back.sum(), rtol=1e-9)
+
+
+@MODES
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 20])
+def test_rotation_products_are_those_of_matrices(mode, count):
+    start, steps = SO3.random(2, generator=seeded(0)), SO3.exp(numbers(2, count, 3))
+    with use_kernels(mode):
+        found = rotation_products(start, steps)
+    assert found.shape == (2, count + 1, 4)
+    R = SO3.to_matrix(start)
+    for k in range(count + 1):
+        assert torch.allclose(SO3.to_matrix(found[:, k]), R, rtol=0, atol=1e-13)
+        R = R @ SO3.to_matrix(steps[:, k]) if k < count else R
+
+
+@MODES
+def test_many_rotation_products_stay_rotations(mode):
+    start = SO3.random(3, generator=seeded(0), dtype=F32)
+    steps = SO3.exp(0.01 * numbers(3, 30_000, 3).to(F32))
+    with use_kernels(mode):
+        found = rotation_products(start, steps)
+    assert found.dtype == F32
+    assert (found.norm(dim=-1) - 1).abs().max() < 3e-7
+    exact = rotation_products(SO3.normalize(start.double()), SO3.normalize(steps.double()))
+    assert (found.double() - exact).norm(dim=-1).max() < 1e-4
+
+
+@MODES
+def test_gradients_of_rotation_products(mode):
+    start, tangents = SO3.random(2, generator=seeded(0)).requires_grad_(), numbers(2, 5, 3).requires_grad_()
+
+    def products(start, tangents):
+        return rotation_products(SO3.normalize(start), SO3.exp(tangents))
+
+    with use_kernels(mode):
+        assert torch.autograd.gradcheck(products, (start, tangents))
+        assert torch.autograd.gradgradcheck(products, (start, tangents), atol=1e-4)
+        mapped = torch.func.vmap(products)(start.detach(), tangents.detach())
+        assert torch.allclose(mapped, products(start, tangents), rtol=0, atol=1e-14)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torchspline import checks
+from torchspline.imu import stamps
 from torchspline.imu.parts import keep
 from torchspline.imu.scan import Element, prefix
 from torchspline.kernels.lowpass import low_pass
@@ -60,8 +61,8 @@ class LowPass(nn.Module):
         checks.is_floating_tensor("x", x)
         if x.ndim < 2:
             raise ValueError(f"x: expected shape (*batch, N, C), got {tuple(x.shape)}")
-        step = intervals(t, x.shape[-2])
-        checks.broadcast(x=x.shape[:-2], t=t.shape[:-1])
+        batch = checks.broadcast(x=x.shape[:-2], t=t.shape[:-1]) if isinstance(t, Tensor) else x.shape[:-2]
+        step = stamps.intervals(t, (*batch, x.shape[-2]), torch.float64, device=x.device)
         pole, gain = self._pole()
         tracked = torch.is_grad_enabled() and any(y.requires_grad for y in (x, step, pole))
         if not tracked and usable(x, step, self.bandwidth):
@@ -79,30 +80,6 @@ class LowPass(nn.Module):
 
     def extra_repr(self) -> str:
         return f"bandwidth={float(self.bandwidth.detach()):g} Hz, order={self.order}"
-
-
-def intervals(t: Tensor, count: int) -> Tensor:
-    """Seconds between neighbouring samples, (..., N - 1), float64."""
-    if not isinstance(t, Tensor):
-        raise TypeError(
-            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
-        )
-    if t.dtype not in (torch.float32, torch.float64, torch.int64):
-        raise TypeError(f"t: expected dtype torch.float32, torch.float64 or torch.int64, got {t.dtype}")
-    if t.ndim == 0 or t.shape[-1] != count:
-        raise ValueError(f"t: expected shape (N,) or (*batch, N), N = {count} times, got {tuple(t.shape)}")
-    if t.dtype == torch.int64:
-        step = t.diff().to(torch.float64) * 1e-9
-    else:
-        checks.finite("t", t)
-        step = t.to(torch.float64).diff()
-    if checks.values_visible(step) and step.numel() and checks.seen_true((step.detach() <= 0).any()):
-        where = tuple(torch.nonzero(step.detach() <= 0)[0].tolist())
-        raise ValueError(
-            f"t: expected increasing times, got {t[where].item()!r} followed by a step of {step[where].item():g} s "
-            f"at index {where}"
-        )
-    return step
 
 
 def _weights(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:

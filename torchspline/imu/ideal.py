@@ -10,10 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchspline import checks
 from torchspline.arithmetic.motion import MOTIONS, Motion, attached
 from torchspline.arithmetic.so3 import unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate, scale
 from torchspline.groups.components import join, split
+from torchspline.imu.parts import along_time
 from torchspline.kernels.mode import flat, usable
 from torchspline.kernels.rowwise import RowKernel
 from torchspline.kernels.threads import SERIAL_BELOW, run, spans
@@ -23,14 +25,13 @@ from torchspline.splines.trajectory import MECHANICS, Trajectory
 class Scene(NamedTuple):
     """Where the IMU sits and what it sits in, each (size,) or (*batch, size).
 
-    `gravity` (3) m/s^2, world; `mount` (7) unit pose of the IMU in the body; `arms` (9) positions of the three axes of
-    the accelerometer in the IMU's frame, axis by axis, m; `earth_rate` (3) rad/s, rotation of the world, in the world.
-    None: there is none.
+    `gravity` (3) m/s^2, world; `T_body_imu` (7) of unit length; `accelerometer_arms` (9), positions of the three axes
+    in the IMU's frame, axis by axis, m; `earth_rate` (3) rad/s, rotation of the world, in the world. None: none.
     """
 
     gravity: Tensor
-    mount: Tensor | None = None
-    arms: Tensor | None = None
+    T_body_imu: Tensor | None = None
+    accelerometer_arms: Tensor | None = None
     earth_rate: Tensor | None = None
 
 
@@ -81,7 +82,7 @@ def _of_state(group: str, value: Vector, *rates: Vector) -> Motion:
 
 
 def exposure(trajectory: Trajectory, t: Tensor, scene: Scene) -> Tensor:
-    """`exposed` at the times `t`: (*batch, N, 6), angular rate and specific force, in the frame of the IMU."""
+    """`exposed` at the times `t`, (N,) or (*batch, N): angular rate and specific force, (*batch, N, 6)."""
     name = trajectory.group.name
     # A trajectory with mechanics of its own answers in them; its state may mean something else.
     stock = type(trajectory).kinematics is Trajectory.kinematics and name in MOTIONS
@@ -97,12 +98,12 @@ def exposure(trajectory: Trajectory, t: Tensor, scene: Scene) -> Tensor:
         assert all(x is not None for x in parts), MECHANICS
         moving, source = parts, None  # type: ignore[assignment]
     like = moving[0]
-    given = [None if x is None else x.to(like.dtype) for x in scene]
-    if t.ndim > 0:
-        given = [x if x is None or x.ndim == 1 else x.unsqueeze(-2) for x in given]
+    batches = {name: x.shape[:-1] for name, x in zip(Scene._fields, scene, strict=True) if x is not None}
+    checks.broadcast(trajectory=like.shape[:-2], **batches)
+    given = [None if x is None else along_time(x, like) for x in scene]
     present = [x for x in given if x is not None]
     tracked = torch.is_grad_enabled() and any(x.requires_grad for x in (*moving, *present))
-    if t.ndim > 0 and not tracked and usable(*moving, *present):
+    if not tracked and usable(*moving, *present):
         return _fused(moving, given, source)
     results = _function(source, tuple(x is not None for x in given))(
         *map(split, moving), *(split(x) for x in present)

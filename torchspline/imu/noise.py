@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.imu import stamps
 from torchspline.imu.scan import linear_recurrence
 from torchspline.kernels import mode, threads
 
@@ -25,7 +26,6 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 _RATIO = 4.0
 #: Shortest correlation time of flicker noise in intervals of its samples.
 _SHORTEST = 0.6
-_NANOSECOND = 1e-9
 #: The largest number below one.
 _INSIDE = 1.0 - 2.0**-53
 # Where the 624 words of the Mersenne twister stand in the state of a generator of PyTorch, in words of 8 bytes.
@@ -338,31 +338,7 @@ def _parameter(
 
 
 def _intervals(t: Tensor, shape: torch.Size, dtype: torch.dtype) -> Tensor:
-    """(..., N, 1) seconds since the sample before, 0 for the first. Differences are taken before any rounding."""
-    if not isinstance(t, Tensor):
-        raise TypeError(
-            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
-        )
-    if t.dtype != torch.int64:
-        if t.dtype not in (torch.float32, torch.float64):
-            raise TypeError(
-                f"t: expected seconds as torch.float32 or torch.float64, or torch.int64, got {t.dtype}"
-            )
-        checks.finite("t", t)
-    if t.ndim == 0 or t.shape[-1] != shape[-2]:
-        raise ValueError(f"t: expected shape ({shape[-2]},) or (*batch, {shape[-2]}), a time for each sample, "
-                         f"got {tuple(t.shape)}")  # fmt: skip
-    try:
-        fits = torch.broadcast_shapes(t.shape, shape[:-1]) == shape[:-1]
-    except RuntimeError:
-        fits = False
-    if not fits:
-        raise ValueError(f"t: expected what broadcasts to {tuple(shape[:-1])}, got {tuple(t.shape)}")
-    steps = t.diff(dim=-1)
-    if checks.values_visible(steps) and checks.seen_true((steps.detach() >= 0).all()) is False:
-        at = torch.nonzero(steps.detach() < 0)[0].tolist()
-        a, b = (t.detach()[(*at[:-1], at[-1] + i)].item() for i in (0, 1))
-        raise ValueError(f"t: expected times that do not decrease, got {a} and then {b}")
-    seconds = steps.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else steps
-    zero = torch.zeros((*seconds.shape[:-1], min(1, shape[-2])), dtype=seconds.dtype, device=t.device)
-    return torch.cat([zero, seconds], -1)[..., None].to(dtype)
+    """(..., N, 1) seconds since the sample before, 0 for the first."""
+    seconds = stamps.intervals(t, shape[:-1], dtype, repeated=True)
+    first = seconds.new_zeros((*seconds.shape[:-1], min(1, shape[-2])))
+    return torch.cat([first, seconds], -1)[..., None]

@@ -1,6 +1,5 @@
 """Keeping and checking the parameters that sensors are made of."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -29,6 +28,8 @@ def tensor_of(name: str, x: Any, shape: tuple[int, ...], meaning: str, batched: 
         checks.is_floating_tensor(name, x)
     else:
         try:
+            if isinstance(x, bool):
+                raise TypeError
             x = torch.tensor(x, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"{name}: expected a tensor or numbers, {meaning}, got {x!r}") from None
@@ -55,14 +56,14 @@ def above_zero(name: str, x: Tensor | None, zero_too: bool = False) -> None:
         raise ValueError(f"{name}: expected numbers {least}, got {y[where].item():g}")
 
 
-def along_time(x: Tensor, like: Tensor, dims: int = 1) -> Tensor:
-    """A parameter (*batch, ...) with `dims` of its own as (*batch, 1, ...), of the dtype of `like`."""
+def along_time(x: Tensor, like: Tensor, name: str = "trajectory") -> Tensor:
+    """A parameter (n,) or (*batch, n) as (n,) or (*batch, 1, n), of the dtype of `like`, which errors call `name`."""
     if x.device != like.device:
         raise ValueError(
-            f"trajectory: on device {like.device}, but the sensor is on {x.device}; move one with .to(device)"
+            f"{name}: on device {like.device}, but the sensor is on {x.device}; move one with .to(device)"
         )
     x = x.to(like.dtype)
-    return x if x.ndim == dims else x.unsqueeze(-1 - dims)
+    return x if x.ndim == 1 else x.unsqueeze(-2)
 
 
 def bias_of(name: str, x: Any, size: int, unit: str) -> Tensor | Trajectory | None:
@@ -82,18 +83,21 @@ def times_of(t: Tensor, trajectory: Trajectory) -> Tensor:
             f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
         )
     if t.dtype not in (torch.float32, torch.float64, torch.int64):
-        raise TypeError(f"t: expected dtype torch.float32, torch.float64 or torch.int64, got {t.dtype}")
+        raise TypeError(
+            "t: expected seconds as torch.float32 or torch.float64, or nanoseconds as torch.int64, "
+            f"got {t.dtype}"
+        )
     if t.dtype != torch.int64:
         checks.finite("t", t)
     return t
 
 
-def common_batch(*shapes: Sequence[int]) -> torch.Size:
-    """The batch that trajectory, times and parameters make together."""
-    try:
-        return torch.broadcast_shapes(*shapes)
-    except RuntimeError:
-        listed = ", ".join(str(tuple(shape)) for shape in shapes)
-        raise ValueError(
-            f"trajectory: batch shapes of trajectory, times and sensor do not broadcast: {listed}"
-        ) from None
+def mean_rate(t: Tensor) -> float:
+    """Samples per second of a sensor that took its samples at `t`, (..., N)."""
+    if t.shape[-1] < 2:
+        raise ValueError("rate: expected samples per second where there is a single stamp, got None")
+    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64).mean().item()
+    seconds = span * 1e-9 if t.dtype == torch.int64 else span
+    if not seconds > 0:
+        raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
+    return (t.shape[-1] - 1) / seconds

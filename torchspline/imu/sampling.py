@@ -72,6 +72,8 @@ class Sampling(nn.Module):
 
         Jitter does not reach beyond a domain whose trajectory refuses times outside.
         """
+        own = {n: x.shape for n, x in (*self._parameters.items(), *self._buffers.items()) if x is not None}
+        checks.broadcast(t=t.shape[:-1], **own)
         late: Tensor | None = None
         seconds = t.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else t.to(torch.float64)
         if self.time_skew is not None:

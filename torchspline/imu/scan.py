@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from torchspline.arithmetic import so3
+from torchspline.groups.group import SO3
 from torchspline.kernels import mode, recurrence
 
 #: What the steps of a scan are made of, time along dimension -2.
@@ -86,3 +88,52 @@ class _LinearRecurrence(Function):
             return None, gx
         before = torch.cat([torch.zeros_like(y[..., :1, :]), y[..., :-1, :]], -2)
         return (gx * before).sum_to_size(factors.shape), gx
+
+
+def rotation_products(start: Tensor, steps: Tensor) -> Tensor:
+    """`q_0 = start`, `q_{k+1} = q_k steps_k`, (*batch, N + 1, 4); differentiable in both to any order.
+
+    Args:
+        start: unit quaternions (*batch, 4). steps: (*batch, N, 4), unit quaternions.
+    """
+    if not mode.usable(start, steps):
+        return _products_reference(start, steps)
+    result: Tensor = _RotationProducts.apply(start, steps)
+    return result
+
+
+def _products_reference(start: Tensor, steps: Tensor) -> Tensor:
+    def combine(earlier: Element, later: Element) -> Element:
+        (p,), (q,) = earlier, later
+        product = torch.stack(so3.multiply(p.unbind(-1), q.unbind(-1)), -1)
+        return (product * (1.5 - 0.5 * product.square().sum(-1, keepdim=True)),)
+
+    return prefix(combine, (torch.cat([start[..., None, :], steps], -2),))[0]
+
+
+class _RotationProducts(Function):
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, steps: Tensor) -> Tensor:
+        batch, rows = steps.shape[:-2], steps.shape[:-2].numel()
+        first = start.detach().contiguous().reshape(rows, 4).numpy()
+        plain = steps.detach().contiguous().reshape(rows, steps.shape[-2], 4).numpy()
+        products = torch.from_numpy(recurrence.rotation_products(first, plain)).reshape(*batch, -1, 4)
+        ctx.save_for_backward(start, steps, products)
+        return products
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, Tensor]:
+        """Turning one step turns all that follows as one body: in the world, the gradient of its turn is their sum.
+
+        Written with the products, which are differentiable themselves: sums along time, and nothing is scanned.
+        """
+        start, steps, products = ctx.saved_tensors
+        q = products.unbind(-1)
+        turns = so3.rotate(q, SO3.arithmetic.pull(q, g.unbind(-1)))
+        following = [x.flip(-1).cumsum(-1).flip(-1) for x in turns]
+        body = so3.unrotate(q, tuple(following))
+        gradients = []
+        for point, at in ((start, 0), (steps, slice(1, None))):
+            tangent = tuple(x[..., at] for x in body)
+            gradients.append(torch.stack(SO3.arithmetic.embed(point.unbind(-1), tangent), -1))
+        return gradients[0], gradients[1]

@@ -10,9 +10,11 @@ from torch import Tensor, nn
 
 from torchspline import checks
 from torchspline.groups.group import SE3, SO3
+from torchspline.imu import stamps
 from torchspline.imu.calibration import lower_triangular, sensor_matrix
 from torchspline.imu.filters import LowPass
 from torchspline.imu.ideal import Scene, exposure
+from torchspline.imu.increments import Increments, compensate, sampled_increments
 from torchspline.imu.noise import (
     Generators,
     flicker_noise,
@@ -21,7 +23,7 @@ from torchspline.imu.noise import (
     white_noise,
 )
 from torchspline.imu.parameters import ImuNoise
-from torchspline.imu.parts import above_zero, along_time, bias_of, common_batch, keep, tensor_of, times_of
+from torchspline.imu.parts import above_zero, along_time, bias_of, keep, mean_rate, tensor_of, times_of
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, excursion
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
@@ -193,6 +195,7 @@ class Imu(nn.Module):
                 checks.instance(name, low_pass, LowPass, "a torchspline.imu.LowPass")
             setattr(self, name, low_pass)
         self.sampling = Sampling(time_offset, time_skew, jitter, drop_probability)
+        checks.broadcast(**self._batches())
 
     @property
     def noise(self) -> ImuNoise | None:
@@ -222,21 +225,22 @@ class Imu(nn.Module):
             raise ValueError(
                 f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
             )
-        stamps = t.reshape(1) if t.ndim == 0 else t
-        instants, valid = self.sampling(trajectory, stamps, generator)
-        signal = self._filtered(self._exposure(trajectory, stamps, instants), instants)
+        at = t.reshape(1) if t.ndim == 0 else t
+        instants, valid = self.sampling(trajectory, at, generator)
+        signal = self._filtered(self._exposure(trajectory, at, instants), instants)
+        checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
         if self.dtype is not None:
             signal = signal.to(self.dtype)
         matrix = self._matrix(signal)
         if matrix is not None:
             signal = signal @ matrix.mT
-        bias, white = self._disturbances(signal, stamps, instants, generator)
-        batch = common_batch(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
+        bias, white = self._disturbances(signal, at, instants, generator)
+        batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
         signal = signal + bias
         if white is not None:
             signal = _plus(signal, white)
         signal = self._converted(signal)
-        lead = (*batch, stamps.shape[-1])
+        lead = (*batch, at.shape[-1])
         bias, valid = bias.expand(*lead, 6), valid.expand(lead)
         if self.sampling.drop_probability is not None:
             signal = signal.masked_fill(~valid.unsqueeze(-1), 0.0)
@@ -264,15 +268,7 @@ class Imu(nn.Module):
         Raises:
             TypeError, ValueError: a wrong type, shape or dtype; a bias that is a trajectory and is not given here.
         """
-        for name in ("gyroscope", "accelerometer"):
-            x = getattr(readings, name, None)
-            if x is None:
-                raise TypeError(
-                    f"readings: expected gyroscope and accelerometer, got {type(readings).__name__}"
-                )
-            checks.is_floating_tensor(name, x)
-            checks.has_last(name, x, 3, "x, y, z")
-        checks.same_kind(gyroscope=readings.gyroscope, accelerometer=readings.accelerometer)
+        _check_readings(readings)
         parts = []
         for name, x, given in (
             ("gyroscope_bias", readings.gyroscope, gyroscope_bias),
@@ -288,17 +284,46 @@ class Imu(nn.Module):
                 checks.has_last(name, given, 3, "x, y, z")
                 checks.broadcast(**{name: given.shape, "readings": x.shape})
             elif own is not None:
-                given = along_time(own, x)
+                checks.broadcast(**{name: own.shape[:-1], "readings": x.shape[:-2]})
+                given = along_time(own, x, "readings")
             parts.append(x if given is None else x - given.to(x.dtype))
-        both = torch.cat(torch.broadcast_tensors(*parts), dim=-1)
+        both = _joined(*parts)
+        checks.broadcast(readings=both.shape[:-2], **self._batches())
         matrix = self._matrix(both)
         if matrix is not None:
             both = both @ torch.linalg.inv(matrix).mT
         return ImuReading(both[..., :3], both[..., 3:])
 
+    def increments(self, readings: Readings | ImuReading, t: Tensor) -> Increments:
+        """Delta-angles and delta-velocities between the samples of readings, with coning and sculling.
+
+        Of an IMU that averages, readings times intervals are integrals, which `compensate` completes; of one that does
+        not, they are samples of a rate that changes evenly in between, `sampled_increments`.
+
+        Args:
+            readings: (*batch, N + 1, 3) of this IMU. t: their stamps, increasing, (N + 1,) or (*batch, N + 1).
+        Returns:
+            Increments: (*batch, N, 3).
+        Differentiable in readings and t.
+        Raises:
+            TypeError, ValueError: a wrong type, shape or value.
+        """
+        _check_readings(readings)
+        w, f = readings.gyroscope, readings.accelerometer
+        if not self.averaging:
+            return sampled_increments(ImuReading(w, f), t)
+        h = stamps.intervals(t, w.shape[:-1], w.dtype, device=w.device).unsqueeze(-1)
+        return compensate(Increments(w[..., 1:, :] * h, f[..., 1:, :] * h), t)
+
     # ------------------------------------------------------------------ parts of the chain
 
-    def _exposure(self, trajectory: Trajectory, stamps: Tensor, instants: Tensor) -> Tensor:
+    def _batches(self) -> dict[str, torch.Size]:
+        """Batch shapes of the parameters that may have one."""
+        own = {**self._parameters, **self._buffers}
+        square = ("g_sensitivity", "accelerometer_arms")
+        return {n: x.shape[: -2 if n in square else -1] for n, x in own.items() if x is not None}
+
+    def _exposure(self, trajectory: Trajectory, at: Tensor, instants: Tensor) -> Tensor:
         mount = self.T_body_imu
         if mount is not None:
             mount = torch.cat([mount[..., :3], SO3.normalize(mount[..., 3:])], dim=-1)
@@ -307,7 +332,7 @@ class Imu(nn.Module):
         if not self.averaging:
             return exposure(trajectory, instants, scene)
         nodes, weights = np.polynomial.legendre.leggauss(self.averaging)
-        interval = 1.0 / self._rate(stamps)
+        interval = 1.0 / self._rate(at)
         total: Tensor | None = None
         for node, weight in zip(nodes, weights, strict=True):
             back = torch.tensor(0.5 * (node - 1.0) * interval, dtype=torch.float64, device=instants.device)
@@ -345,7 +370,7 @@ class Imu(nn.Module):
         return sensor_matrix(triad(*gyroscope), triad(*accelerometer), rotation, leak)
 
     def _disturbances(
-        self, signal: Tensor, stamps: Tensor, instants: Tensor, generator: Generators
+        self, signal: Tensor, at: Tensor, instants: Tensor, generator: Generators
     ) -> tuple[Tensor, Tensor | None]:
         """Bias (..., 1 or N, 6) and white noise (..., N, 6)."""
         parts = []
@@ -374,27 +399,24 @@ class Imu(nn.Module):
             name: density(name)
             for name in ("noise_density", "random_walk", "bias_sigma", "bias_time", "bias_instability")
         }
-        batch = common_batch(
-            signal.shape[:-2], bias.shape[:-2], *(x.shape[:-2] for x in densities.values() if x is not None)
-        )
+        known = [x.shape[:-2] for x in densities.values() if x is not None]
+        batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], *known)
         if isinstance(generator, (list, tuple)) and not batch:
             batch = torch.Size([len(generator)])
-        shape = (*batch, stamps.shape[-1], 6)
+        shape = (*batch, at.shape[-1], 6)
         white = None
         if densities["noise_density"] is not None:
-            white = white_noise(
-                shape, densities["noise_density"], self._rate(stamps), generator, signal.dtype
-            )
+            white = white_noise(shape, densities["noise_density"], self._rate(at), generator, signal.dtype)
         if densities["random_walk"] is not None:
-            bias = _plus(random_walk(shape, densities["random_walk"], stamps, generator, signal.dtype), bias)
+            bias = _plus(random_walk(shape, densities["random_walk"], at, generator, signal.dtype), bias)
         if densities["bias_sigma"] is not None:
             time = densities["bias_time"]
             assert time is not None
             driving = densities["bias_sigma"] * (2.0 / time).sqrt()
-            bias = _plus(gauss_markov(shape, driving, time, stamps, generator, signal.dtype), bias)
+            bias = _plus(gauss_markov(shape, driving, time, at, generator, signal.dtype), bias)
         if densities["bias_instability"] is not None:
             bias = _plus(
-                flicker_noise(shape, densities["bias_instability"], stamps, generator, signal.dtype), bias
+                flicker_noise(shape, densities["bias_instability"], at, generator, signal.dtype), bias
             )
         return bias, white
 
@@ -416,16 +438,18 @@ class Imu(nn.Module):
             return None
         return _joined(*(like.new_full((3,), missing) if x is None else along_time(x, like) for x in both))
 
-    def _rate(self, stamps: Tensor) -> float:
-        if self.rate is not None:
-            return self.rate
-        if stamps.shape[-1] < 2:
-            raise ValueError("rate: expected samples per second where there is a single stamp, got None")
-        span = (stamps[..., -1] - stamps[..., 0]).detach().to(torch.float64).mean().item()
-        seconds = span * 1e-9 if stamps.dtype == torch.int64 else span
-        if not seconds > 0:
-            raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
-        return (stamps.shape[-1] - 1) / seconds
+    def _rate(self, at: Tensor) -> float:
+        return mean_rate(at) if self.rate is None else self.rate
+
+
+def _check_readings(readings: Any) -> None:
+    for name in ("gyroscope", "accelerometer"):
+        x = getattr(readings, name, None)
+        if x is None:
+            raise TypeError(f"readings: expected gyroscope and accelerometer, got {type(readings).__name__}")
+        checks.is_floating_tensor(name, x)
+        checks.has_last(name, x, 3, "x, y, z")
+    checks.same_kind(gyroscope=readings.gyroscope, accelerometer=readings.accelerometer)
 
 
 def _plus(own: Tensor, other: Tensor) -> Tensor:
