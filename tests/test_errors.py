@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_generate
 import error_imu
 import error_imu_earth
 import error_imu_noise
@@ -16,13 +17,14 @@ from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
 import torchspline
 import torchspline.io as records
+from torchspline import generate
 from torchspline.fit import BatchProblem, SlidingWindow
 from torchspline.fit.losses import Loss
 from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-MORE = (error_online, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown)
+MORE = (error_online, error_generate, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown)
 CASES = [case for more in MORE for case in more.CASES]
 
 
@@ -73,7 +75,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
+    for root in (torchspline, records, generate, Mounted, SlidingWindow, BatchProblem):
         visit(root)
     return found
 
@@ -90,6 +92,7 @@ RESULTS = {
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Written",
     "Readings",
     "AmbientReadings",
 }
@@ -97,6 +100,7 @@ RESULTS = {
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "Recipe.as_dict": "no arguments",
     "LowPass.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchspline import SO3, imu
-from torchspline.imu.scan import prefix
+from torchspline.imu.scan import rotation_products
 
 #: Readings that are averaged before anything else: 10 Hz from 200 Hz.
 GROUP = 20
@@ -29,6 +29,10 @@ GRAVITY = 9.80665
 LOCAL, SHARED = 6, 12
 #: Of an instant, for the network.
 FEATURES = 5
+#: Instants in a second, odd.
+NEIGHBOURS = 11
+#: Of the network's output, so that it learns in few steps what spans orders of magnitude.
+GAIN = 4.0
 
 
 class Calibration(NamedTuple):
@@ -84,12 +88,14 @@ class Calibrator(nn.Module):
             whitening = torch.zeros(taps)
             whitening[taps // 2] = 1.0
             self.whitening = nn.Parameter(whitening)
-        # Logarithms of standard deviations: velocity [m/s] and body rate [rad/s] of a motion at an instant.
-        self.log_motion = nn.Parameter(torch.tensor([1.0, 2.0]).log())
+        # Logarithm of the standard deviation of a motion's velocity [m/s] at an instant.
+        self.log_velocity = nn.Parameter(torch.tensor(0.0))
+        # Body rates [rad/s] are of the order of their changes within a second: the less change, the nearer to rest.
+        self.log_rate = nn.Parameter(torch.tensor([5.0, 2.72]).log())
         # Those of biases and scales of sensors (gyroscope, then accelerometer).
         self.log_priors = nn.Parameter(torch.tensor([0.05, 0.003, 0.05, 0.003]).log())
         # A gyroscope that is good in two axes is good in the third: the prior of later steps.
-        self.log_good = nn.Parameter(torch.tensor(0.01).log())
+        self.log_good = nn.Parameter(torch.tensor(0.002).log())
         self.log_alike = nn.Parameter(torch.tensor(0.0))
         # Of the filter that takes noise off the readings.
         self.smoothing = nn.Parameter(torch.zeros(8))
@@ -135,10 +141,10 @@ class Calibrator(nn.Module):
         size = min(round(length / h), rate.shape[1])
         H, right = self._velocity(*(stretches(x, size) for x in (rate, force)), h, weights)
         # Bodies turn to and fro, and some of the time they rest.
-        still = (-2.0 * self.log_motion[1]).exp().to(rate)
-        if weights is not None:
-            still = still * weights[..., 1:].exp()
-        still = still.expand(*rate.shape[:2], 1)
+        if weights is None:
+            still = torch.ones_like(rate[..., :1])
+        else:
+            still = weights[..., 1:].exp()
         H = H + torch.diag_embed(F.pad(still.sum(1).expand(-1, 3), (0, SHARED - 3)))
         right = right + F.pad((still * rate).sum(1), (0, SHARED - 3))
         # Priors hold for the whole calibration rather than for this step.
@@ -178,7 +184,7 @@ class Calibrator(nn.Module):
             trust = stretches(weights[..., :1], R.shape[2])
             cut = (R.shape[2] - rows.shape[2]) // 2
             rows = rows * (0.5 * trust[:, :, cut : cut + rows.shape[2], :, None]).exp()
-        rows = (rows * (-self.log_motion[0]).exp()).flatten(2, 3)
+        rows = (rows * (-self.log_velocity).exp()).flatten(2, 3)
         normal = rows.mT @ rows
         own, mixed = normal[..., :LOCAL, :LOCAL], normal[..., LOCAL:, :LOCAL]
         # The length of u is known: along its direction it is GRAVITY, within a mm/s^2.
@@ -215,7 +221,10 @@ class Calibrator(nn.Module):
             ],
             1,
         )  # fmt: skip
-        return self.trust(features.to(self.whitening.dtype)).mT.to(gyroscope)
+        change = F.max_pool1d(w_change[:, None], NEIGHBOURS, 1, NEIGHBOURS // 2).to(self.log_rate)
+        log_rate = self.log_rate[0] + self.log_rate[1] * (change + 1e-3).log()
+        found = GAIN * self.trust(features.to(self.log_rate.dtype))
+        return (found - torch.cat([torch.zeros_like(log_rate), 2.0 * log_rate], 1)).mT.to(gyroscope)
 
 
 def grouped(x: Tensor) -> Tensor:
@@ -240,11 +249,8 @@ def orientations(rate: Tensor, h: float) -> Tensor:
 
 def running(steps: Tensor) -> Tensor:
     """Products of rotations (..., K, 4) from the first to each."""
-
-    def combine(earlier: tuple[Tensor, ...], later: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        return (SO3.compose(earlier[0], later[0], validate=False),)
-
-    return prefix(combine, (steps,))[0]
+    start = SO3.identity(*steps.shape[:-2], dtype=steps.dtype)
+    return rotation_products(start, steps)[..., 1:, :]
 
 
 def skew(x: Tensor) -> Tensor:

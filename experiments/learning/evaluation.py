@@ -4,12 +4,11 @@ import math
 from typing import NamedTuple
 
 import torch
-from learning.estimator import running
 from learning.training import LAGS
 from recordings.load import SECOND, Recording, usable
 from torch import Tensor
 
-from torchspline import SO3
+from torchspline import SO3, imu
 from torchspline.io import PoseRecord
 
 #: s, between the starts of compared windows.
@@ -32,7 +31,7 @@ class Errors(NamedTuple):
 def orientation_errors(recording: Recording, gyroscope: Tensor) -> Errors:
     """What integrating `gyroscope`, (N, 3) corrected readings at the recording's stamps, makes of the poses."""
     stamps, poses = recording.samples.time_ns, usable(recording.poses)
-    rotation = integrate(gyroscope, stamps)
+    rotation = imu.integrate_gyroscope(gyroscope, stamps)
     origin = int(stamps[0])
     at, true = _on_grid(poses, int(stamps[0]), int(stamps[-1]))
     made = _at(rotation, stamps, at)
@@ -56,17 +55,10 @@ def orientation_errors(recording: Recording, gyroscope: Tensor) -> Errors:
     return Errors(lags, rms(angle), rms(tilt), (at - origin).to(torch.float64) / SECOND, angle)
 
 
-def integrate(gyroscope: Tensor, stamps: Tensor) -> Tensor:
-    """Rotations (N, 4) from the identity on, by trapezoids."""
-    dt = stamps.diff().to(torch.float64)[:, None] / SECOND
-    steps = SO3.exp(0.5 * (gyroscope[1:] + gyroscope[:-1]) * dt)
-    return running(torch.cat([SO3.identity(1), steps]))
-
-
 def best_bias(recording: Recording) -> Tensor:
     """The mean difference between the gyroscope and the rates of the poses: the best that a constant bias can do."""
     stamps, poses = recording.samples.time_ns, usable(recording.poses)
-    rotation = integrate(recording.samples.gyroscope, stamps)
+    rotation = imu.integrate_gyroscope(recording.samples.gyroscope, stamps)
     at, true = _on_grid(poses, int(stamps[0]), int(stamps[-1]))
     made = _at(rotation, stamps, at)
     h = at.diff().to(torch.float64)[:, None] / SECOND

@@ -29,6 +29,7 @@ Column = Tensor | list[str]
 
 def items_per_block(recipe: Recipe) -> int:
     """A power of two, so that shards of usual sizes are made of whole blocks."""
+    checks.instance("recipe", recipe, Recipe, "a Recipe")
     wanted = max(1, min(_MOST_ITEMS, _MOST_READINGS // recipe.samples))
     return 1 << (wanted.bit_length() - 1)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchspline.generate.distributions import Distribution, Parameter
 from torchspline.groups import R3, SO3
-from torchspline.imu.scan import Element, prefix
+from torchspline.imu.scan import rotation_products
 from torchspline.kernels.mode import use_kernels
 from torchspline.splines.bspline import bspline
 
@@ -98,12 +98,7 @@ def turned(rates: Tensor, tau: Tensor, start: Tensor) -> Tensor:
     Trapezoids over the steps of `tau`.
     """
     middle = 0.5 * (rates[:, 1:] + rates[:, :-1]) * tau.diff(dim=1)[..., None]
-    steps = torch.cat([start[:, None], SO3.exp(middle, validate=False)], dim=1)
-
-    def combine(earlier: Element, later: Element) -> Element:
-        return (SO3.compose(earlier[0], later[0], validate=False),)
-
-    return SO3.normalize(prefix(combine, (steps,))[0], validate=False)
+    return rotation_products(start, SO3.exp(middle, validate=False))
 
 
 def differences(x: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
