@@ -105,7 +105,9 @@ def recipes() -> Iterator[Case]:
     yield refused(function, "motions", "option", drone, "{'gauss': [0, 1]}", "one distribution out of uniform",
                   "motions.drone.drag")  # fmt: skip
     yield refused(function, "sensor", "nan", {"jitter": NAN}, "got nan", "a finite number", "sensor.jitter")
-    yield refused(function, "sensor", "option", {"jitter": 3}, "from 3 to 3", "values from 0 to 0.1", "sensor.jitter")
+    yield refused(
+        function, "sensor", "option", {"jitter": 3}, "from 3 to 3", "values from 0 to 0.1", "sensor.jitter"
+    )
     yield refused(function, "rest", "type", None, "got None", "expected a number")
     yield refused(function, "mounting", "option", "down", "got 'down'", "'upright', 'random'")
     yield refused(function, "dtype", "option", "half", "got 'half'", "'float32', 'float64'")

@@ -107,7 +107,14 @@ def imu_force(motion) -> torch.Tensor:
 
 def test_walking_goes_forward_step_by_step():
     _, motion = made(
-        "walking", speed=1.2, step_frequency=1.5, bounce=0.03, sway=0.02, wobble=0.05, turn_rate=0.2
+        "walking",
+        speed=1.2,
+        step_frequency=1.5,
+        bounce=0.03,
+        sway=0.02,
+        wobble=0.05,
+        turn_rate=0.2,
+        circling=0.3,
     )
     velocity = motion.velocity[..., :2].norm(dim=-1)
     assert velocity.mean().item() == pytest.approx(1.2, rel=0.05)
@@ -116,6 +123,9 @@ def test_walking_goes_forward_step_by_step():
     height = motion.position[..., 2]
     assert 0.02 < height.amax().item() < 0.06
     forward = SO3.act(motion.rotation, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    assert SO3.act(motion.rotation, motion.angular_velocity)[..., 2].mean().item() == pytest.approx(
+        0.3, abs=0.03
+    )
     along = (forward * motion.velocity).sum(-1)
     assert along.mean().item() == pytest.approx(1.2, rel=0.1)
 
@@ -186,7 +196,9 @@ def test_differences_and_facing():
 
 
 def test_motion_faster_than_the_knots_is_refused():
-    with pytest.raises(ValueError, match=r"smooth: frequencies reach 6 Hz, but knots 0.02 s apart carry 5 Hz"):
+    with pytest.raises(
+        ValueError, match=r"smooth: frequencies reach 6 Hz, but knots 0.02 s apart carry 5 Hz"
+    ):
         random_motion("smooth", 1, 1.0, bandwidth={"uniform": [1.0, 6.0]})
     random_motion("smooth", 1, 1.0, bandwidth=6.0, knot_spacing=0.01)
     with pytest.raises(ValueError, match=r"walking: frequencies reach"):

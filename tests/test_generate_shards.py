@@ -49,7 +49,9 @@ def hashes(folder: Path) -> dict[str, str]:
 def folder(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("whole") / "made" / "here"
     calls: list[tuple[int, int]] = []
-    done = write(RECIPE, path, seed=7, items=ITEMS, items_per_shard=PER_SHARD, progress=lambda *x: calls.append(x))
+    done = write(
+        RECIPE, path, seed=7, items=ITEMS, items_per_shard=PER_SHARD, progress=lambda *x: calls.append(x)
+    )
     assert done == (4, ITEMS, 0)
     assert calls == [(200, 700), (400, 700), (600, 700), (700, 700)]
     return path
@@ -63,7 +65,11 @@ def test_what_is_read_is_what_was_generated(folder):
         found = data[i]
         assert found.keys() == item.keys()
         for name, x in item.items():
-            same = torch.equal(x, found[name]) and x.dtype == found[name].dtype if torch.is_tensor(x) else x == found[name]
+            same = (
+                torch.equal(x, found[name]) and x.dtype == found[name].dtype
+                if torch.is_tensor(x)
+                else x == found[name]
+            )
             assert same, (i, name)
     assert data[-1]["index"] == ITEMS - 1
     with pytest.raises(IndexError, match="index: expected one below 700, got 700"):
@@ -148,11 +154,11 @@ def test_incomplete_and_damaged_data_sets_are_not_read(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"1 are missing \(shard-000002.parquet\); generate again"):
         read(tmp_path)
     shard.write_bytes(content[:-50])
-    with pytest.raises(ValueError, match="shard-000002.parquet is damaged; remove it"):
+    with pytest.raises(ValueError, match=r"shard-000002.parquet is damaged; remove it"):
         read(tmp_path)
     middle = len(content) // 2
     shard.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
-    with pytest.raises(ValueError, match="shard-000002.parquet is damaged"):
+    with pytest.raises(ValueError, match=r"shard-000002.parquet is damaged"):
         [read(tmp_path)[i] for i in range(400, 600)]
     (tmp_path / "dataset.json").write_text(json.dumps({"format": "other"}))
     with pytest.raises(ValueError, match="expected a data set of format 'torchspline items 1'"):
@@ -201,7 +207,9 @@ def test_killed_again_and_again_the_data_set_is_the_same(config, undisturbed, tm
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert process.returncode == -signal.SIGKILL
-    done = subprocess.run([sys.executable, *command(config, tmp_path)], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, *command(config, tmp_path)], capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     assert hashes(tmp_path) == hashes(undisturbed)
     found = [item["index"].item() for item in map(read(tmp_path).__getitem__, range(2100))]

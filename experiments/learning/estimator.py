@@ -1,4 +1,4 @@
-"""A network that calibrates an IMU while it moves: what the accelerometer says about gravity tells the gyroscope's errors.
+"""A network that calibrates an IMU while it moves: what the accelerometer says about gravity shows gyroscope errors.
 
 Readings, turned by the integrated gyroscope into a frame that does not rotate, are gravity plus the acceleration of the
 motion. Errors of the gyroscope turn gravity away with time; the acceleration of the motion does not, since velocity
@@ -6,10 +6,10 @@ stays bounded. So the velocity that is integrated in this frame is, within a str
 
     v(t) = v0 + u t - [u]x int(Phi_b db + Phi_s ds) + int(R dc + R diag(a) da) + (velocity of the motion)
 
-with u opposite to gravity, Phi_b = int R, Phi_s = int R diag(w), corrections db, ds to bias and scale of the gyroscope and
-dc, da to those of the accelerometer. This is linear least squares once more and more exact readings are at hand. What
-the network learns is how the velocity of a motion behaves: a whitening filter, how much to trust each instant, and what
-sensors are like (the widths of the priors).
+with u opposite to gravity, Phi_b = int R, Phi_s = int R diag(w), corrections db, ds to bias and scale of the gyroscope
+and dc, da to those of the accelerometer. While the body rests, the gyroscope reads its bias. This is linear least squares once more and more exact readings are at hand.
+What the network learns is how motions behave: a whitening filter for their velocity, how much to trust each instant,
+what is a rest; and what sensors are like, the widths of the priors.
 """
 
 from collections.abc import Sequence
@@ -155,7 +155,12 @@ class Calibrator(nn.Module):
             information = torch.cat([1.0 / good[:, None], information[:, 1:]], -1)
         information = information.repeat_interleave(3, -1)
         so_far = torch.cat(
-            [now.gyroscope_bias, now.gyroscope_scale - 1, now.accelerometer_bias, now.accelerometer_scale - 1],
+            [
+                now.gyroscope_bias,
+                now.gyroscope_scale - 1,
+                now.accelerometer_bias,
+                now.accelerometer_scale - 1,
+            ],
             -1,
         )
         return torch.linalg.solve(H + torch.diag_embed(information), right - information * so_far)

@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 import torch
-from learning.training import LAGS
 from recordings.load import SECOND, Recording, usable
 from torch import Tensor
 
+from learning.training import LAGS
 from torchspline import SO3, imu
 from torchspline.io import PoseRecord
 

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.distributed as dist
-from learning.estimator import GROUP, Calibration, Calibrator, grouped, running
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
+from learning.estimator import GROUP, Calibration, Calibrator, grouped, running
 from torchspline import SO3
 from torchspline.generate import GeneratedDataset, Recipe, items_per_block
 

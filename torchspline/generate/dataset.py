@@ -22,8 +22,9 @@ class GeneratedDataset(IterableDataset):
     Items are dictionaries: `index`; `motion`, a word; `motion_parameters`, JSON; `time` (N,) s, `gyroscope`,
     `accelerometer` (N, 3), what the sensor says; `angular_velocity`, `specific_force` (N, 3), what it should say;
     `gyroscope_bias`, `accelerometer_bias` (N, 3); `rotation` (N, 4), `position`, `velocity` (N, 3) of the body in the
-    world; `control_points` (M, 7) of its `SplitBSpline` of order 6; what was drawn of the sensor as
-    `sensor_gyroscope_scale` etc.; `valid` (N,), 0 where a sample was lost, if samples get lost. rad/s, m/s^2, m, s. `DataLoader(dataset, batch_size=..., num_workers=...)` makes batches of them.
+    world; `control_points` (M, 7) of its `SplitBSpline` of order 6; what was drawn of the sensor, as
+    `sensor_gyroscope_scale` etc.; where samples get lost, `valid` (N,), 0 for those. Units are rad/s, m/s^2, m and s.
+    `DataLoader(dataset, batch_size=..., num_workers=...)` makes batches of them.
 
     Args:
         recipe: what they are drawn from.
@@ -52,9 +53,7 @@ class GeneratedDataset(IterableDataset):
         while end is None or number * size < end:
             first = number * size
             stop = size if end is None else min(end - first, size)
-            columns = rows(
-                compute_block(self.recipe, self.seed, number), max(self.start - first, 0), stop
-            )
+            columns = rows(compute_block(self.recipe, self.seed, number), max(self.start - first, 0), stop)
             for i in range(len(columns["index"])):
                 yield {name: x[i] for name, x in columns.items()}
             number += world * workers

@@ -1,5 +1,6 @@
 """Distributions that a configuration may name: `0.5`, `{uniform: [a, b]}`, `{normal: [mean, deviation]}`, ..."""
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -186,10 +187,8 @@ def distribution_of(path: str, value: Any, parameter: Parameter) -> Distribution
 def number_at(path: str, value: Any) -> float:
     """A finite number in a configuration; YAML 1.1 reads `1e-3`, without a point, as text."""
     if isinstance(value, str):
-        try:
+        with contextlib.suppress(ValueError):
             value = float(value)
-        except ValueError:
-            pass
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{path}: expected a number, got {value!r}")
     if not math.isfinite(value):

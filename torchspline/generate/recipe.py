@@ -153,5 +153,3 @@ def _mapping(path: str, value: Any, known: Mapping[str, Any] | None = None) -> d
         if known is not None and name not in known:
             raise ValueError(f"{path}.{name}: expected one of {', '.join(known)}, got {name!r}")
     return dict(value)
-
-

@@ -12,7 +12,7 @@ from torchspline.imu import Imu, ImuNoise
 from torchspline.splines import Trajectory
 
 _ZERO, _ONE = Constant(0.0), Constant(1.0)
-_ANY = {"least": -float("inf")}
+_ANY = -float("inf")
 
 #: What can be randomised of an IMU: the arguments of `imu.Imu` and `imu.ImuNoise` under their names. Unless told
 #: otherwise it is perfect; effects that nobody names are not computed.
@@ -27,16 +27,16 @@ SENSOR_PARAMETERS: dict[str, Parameter] = {
     "accelerometer_bias_time": Parameter("s", Constant(1000.0), least=1e-6),
     "gyroscope_bias_instability": Parameter("rad/s", _ZERO),
     "accelerometer_bias_instability": Parameter("m/s^2", _ZERO),
-    "gyroscope_bias": Parameter("rad/s", _ZERO, **_ANY, size=3),
-    "accelerometer_bias": Parameter("m/s^2", _ZERO, **_ANY, size=3),
+    "gyroscope_bias": Parameter("rad/s", _ZERO, _ANY, size=3),
+    "accelerometer_bias": Parameter("m/s^2", _ZERO, _ANY, size=3),
     "gyroscope_scale": Parameter("", _ONE, least=1e-3, size=3),
     "accelerometer_scale": Parameter("", _ONE, least=1e-3, size=3),
-    "gyroscope_misalignment": Parameter("", _ZERO, **_ANY, size=3),
-    "accelerometer_misalignment": Parameter("", _ZERO, **_ANY, size=3),
-    "gyroscope_rotation": Parameter("rad", _ZERO, **_ANY, size=3, meaning="a rotation vector"),
-    "g_sensitivity": Parameter("rad/s per m/s^2", _ZERO, **_ANY, size=9, meaning="row by row"),
-    "lever_arm": Parameter("m", _ZERO, **_ANY, size=3, meaning="of the IMU in the body"),
-    "accelerometer_arms": Parameter("m", _ZERO, **_ANY, size=9, meaning="axis by axis"),
+    "gyroscope_misalignment": Parameter("", _ZERO, _ANY, size=3),
+    "accelerometer_misalignment": Parameter("", _ZERO, _ANY, size=3),
+    "gyroscope_rotation": Parameter("rad", _ZERO, _ANY, size=3, meaning="a rotation vector"),
+    "g_sensitivity": Parameter("rad/s per m/s^2", _ZERO, _ANY, size=9, meaning="row by row"),
+    "lever_arm": Parameter("m", _ZERO, _ANY, size=3, meaning="of the IMU in the body"),
+    "accelerometer_arms": Parameter("m", _ZERO, _ANY, size=9, meaning="axis by axis"),
     "time_offset": Parameter("s", _ZERO, least=-1.0, most=1.0),
     "time_skew": Parameter("s/s", _ZERO, least=-0.1, most=0.1),
     "jitter": Parameter("s", _ZERO, most=0.1),

@@ -132,9 +132,7 @@ class ShardedDataset(Dataset):
             )
         for shard, path in enumerate(self.files):
             if not _is_complete(path, self.manifest, shard):
-                raise ValueError(
-                    f"folder: {path} is damaged; remove it and generate again to replace it"
-                )
+                raise ValueError(f"folder: {path} is damaged; remove it and generate again to replace it")
         self._held: tuple[int, int, dict[str, Column]] | None = None
 
     def __len__(self) -> int:
@@ -172,7 +170,8 @@ def pyarrow() -> Any:
         import pyarrow.parquet
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            f"{error.name} reads and writes Parquet files: pip install 'torchspline[generate]'", name=error.name
+            f"{error.name} reads and writes Parquet files: pip install 'torchspline[generate]'",
+            name=error.name,
         ) from None
     return pyarrow
 

@@ -27,6 +27,9 @@ class Walking(Motion):
         "sway": Parameter("m", Uniform(0.01, 0.03), most=0.5, meaning="amplitude, to the side"),
         "wobble": Parameter("rad", Uniform(0.02, 0.12), most=1.0, meaning="amplitude about each axis"),
         "turn_rate": Parameter("rad/s", Uniform(0.05, 0.4), most=5.0, meaning="RMS of the heading's rate"),
+        "circling": Parameter(
+            "rad/s", Uniform(-0.2, 0.2), least=-5.0, most=5.0, meaning="mean of the heading's rate"
+        ),
     }
 
     def poses(
@@ -36,6 +39,7 @@ class Walking(Motion):
         heading, phase = uniform(generator, count, 1), uniform(generator, count, 6, OVERTONES)
         slow = torch.full((count,), WANDERING, dtype=torch.float64)
         turning = smooth_curve(tau, slow, generator, rate=0)[..., 0] * drawn["turn_rate"][:, None]
+        turning = turning + drawn["circling"][:, None]
         steps = tau.diff(dim=1)
         zero = torch.zeros_like(tau[:, :1])
         heading = heading + torch.cat([zero, (0.5 * (turning[:, 1:] + turning[:, :-1]) * steps).cumsum(1)], 1)
