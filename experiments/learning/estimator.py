@@ -7,9 +7,9 @@ stays bounded. So the velocity that is integrated in this frame is, within a str
     v(t) = v0 + u t - [u]x int(Phi_b db + Phi_s ds) + int(R dc + R diag(a) da) + (velocity of the motion)
 
 with u opposite to gravity, Phi_b = int R, Phi_s = int R diag(w), corrections db, ds to bias and scale of the gyroscope
-and dc, da to those of the accelerometer. While the body rests, the gyroscope reads its bias. This is linear least squares once more and more exact readings are at hand.
-What the network learns is how motions behave: a whitening filter for their velocity, how much to trust each instant,
-what is a rest; and what sensors are like, the widths of the priors.
+and dc, da to those of the accelerometer; and while the body rests, the gyroscope reads its bias. This is linear least
+squares, repeated with the readings that it corrects. What the network learns is how motions behave (a whitening filter
+for their velocity, how much to trust an instant, what is a rest) and what sensors are like (the widths of priors).
 """
 
 from collections.abc import Sequence
