@@ -123,8 +123,9 @@ class Calibrator(nn.Module):
         half = torch.softmax(torch.cat([self.smoothing.new_zeros(1), self.smoothing]), 0).to(x)
         kernel = torch.cat([half[1:].flip(0) / 2, half[:1], half[1:] / 2])
         reach = len(self.smoothing)
-        padded = F.pad(x.mT, (reach, reach), mode="replicate")
-        return F.conv1d(padded.flatten(0, 1)[:, None], kernel[None, None]).view_as(x.mT).mT
+        padded = F.pad(x.mT, (reach, reach), mode="replicate").mT
+        shifted = [padded[:, i : i + x.shape[1]] for i in range(2 * reach + 1)]
+        return sum((k * y for k, y in zip(kernel, shifted, strict=True)), torch.zeros_like(x))
 
     def _step(
         self,
@@ -204,11 +205,13 @@ class Calibrator(nn.Module):
         return reduced[..., :-1, :-1], reduced[..., :-1, -1]
 
     def _whitened(self, rows: Tensor) -> Tensor:
-        """Filtered along time; only where the whole filter fits."""
-        batch, count, length, *rest = rows.shape
-        flat = rows.flatten(3).permute(0, 1, 3, 2).reshape(-1, 1, length)
-        out = F.conv1d(flat, self.whitening.to(rows)[None, None])
-        return out.view(batch, count, -1, out.shape[-1]).permute(0, 1, 3, 2).unflatten(-1, tuple(rest))
+        """Filtered along time, (B, S, K, ...); only where the whole filter fits."""
+        length, taps = rows.shape[2], len(self.whitening)
+        # A matrix, because convolutions in double precision are slow.
+        tap = torch.arange(length) - torch.arange(length - taps + 1)[:, None]
+        inside = (tap >= 0) & (tap < taps)
+        matrix = self.whitening.to(rows)[tap.clamp(0, taps - 1)] * inside
+        return (matrix @ rows.flatten(3)).unflatten(3, rows.shape[3:])
 
     def _weights(self, gyroscope: Tensor, accelerometer: Tensor) -> Tensor:
         """Logarithms of weights, (B, K, 2), from what depends neither on bias nor on how the sensor is mounted."""
