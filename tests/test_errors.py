@@ -8,6 +8,7 @@ from typing import Any
 
 import error_generate
 import error_imu
+import error_imu_allan
 import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
@@ -24,8 +25,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-MORE = (error_online, error_generate, error_imu, error_imu_earth, error_imu_noise, error_imu_strapdown)
-CASES = [case for more in MORE for case in more.CASES]
+IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
+CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
 
 
 def label(case: Case) -> str:
@@ -83,7 +84,9 @@ def public() -> dict[str, Callable[..., Any]]:
 #: What the library makes and hands out; nobody is meant to call these.
 RESULTS = {
     "State",
+    "AllanDeviation",
     "Kinematics",
+    "NoiseEstimate",
     "ImuReading",
     "Increments",
     "Navigation",
@@ -226,7 +229,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in MORE:
+for _more in (error_online, *IMU):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 

@@ -82,29 +82,54 @@ def exposed_twin(trajectory, time, p):
     return rate, np.array(forces)
 
 
-def readings_twin(trajectory, times, p, averaging):
-    """The chain as the docstring of `Imu` has it, one sample after the other, with loops over rows and columns."""
-    start, stop = trajectory.domain
-    mid, interval = 0.5 * (start + stop), (times[-1] - times[0]) / (len(times) - 1)
+def averaged_twin(trajectory, time, p, averaging, interval):
     nodes, weights = np.polynomial.legendre.leggauss(averaging) if averaging else ([1.0], [2.0])
+    parts = [exposed_twin(trajectory, time + 0.5 * (node - 1.0) * interval, p) for node in nodes]
+    return tuple(
+        sum(0.5 * w * x for w, x in zip(weights, some, strict=True)) for some in zip(*parts, strict=True)
+    )
+
+
+def calibrated_twin(rate, force, p):
+    """Row by row and column by column."""
+    C = Rotation.from_quat(np.roll(p["gyroscope_rotation"], -1)).inv()
+    rate_g, force_g = C.apply(rate), C.apply(force)
+    gyro, accel = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        gyro[i] = p["gyroscope_scale"][i] * rate_g[i] + p["g_sensitivity"][i] @ force_g
+        accel[i] = p["accelerometer_scale"][i] * force[i]
+    for k, (i, j) in enumerate(((1, 0), (2, 0), (2, 1))):
+        gyro[i] += p["gyroscope_misalignment"][k] * rate_g[j]
+        accel[i] += p["accelerometer_misalignment"][k] * force[j]
+    return gyro, accel
+
+
+def instant_twin(trajectory, stamp, p):
+    start, stop = trajectory.domain
+    mid = 0.5 * (start + stop)
+    return mid + (stamp - p["time_offset"] - mid) / (1.0 + p["time_skew"])
+
+
+def readings_twin(trajectory, times, p, averaging):
+    """The chain as the docstring of `Imu` has it, one sample after the other."""
+    interval = (times[-1] - times[0]) / (len(times) - 1)
     rows = []
     for stamp in times:
-        time = mid + (stamp - p["time_offset"] - mid) / (1.0 + p["time_skew"])
-        rate, force = np.zeros(3), np.zeros(3)
-        for node, weight in zip(nodes, weights, strict=True):
-            parts = exposed_twin(trajectory, time + 0.5 * (node - 1.0) * interval, p)
-            rate, force = rate + 0.5 * weight * parts[0], force + 0.5 * weight * parts[1]
-        C = Rotation.from_quat(np.roll(p["gyroscope_rotation"], -1)).inv()
-        rate_g, force_g = C.apply(rate), C.apply(force)
-        gyro, accel = p["gyroscope_bias"].copy(), p["accelerometer_bias"].copy()
-        for i in range(3):
-            gyro[i] += p["gyroscope_scale"][i] * rate_g[i] + p["g_sensitivity"][i] @ force_g
-            accel[i] += p["accelerometer_scale"][i] * force[i]
-        for k, (i, j) in enumerate(((1, 0), (2, 0), (2, 1))):
-            gyro[i] += p["gyroscope_misalignment"][k] * rate_g[j]
-            accel[i] += p["accelerometer_misalignment"][k] * force[j]
-        rows.append((gyro, accel))
+        exposed = averaged_twin(trajectory, instant_twin(trajectory, stamp, p), p, averaging, interval)
+        gyro, accel = calibrated_twin(*exposed, p)
+        rows.append((gyro + p["gyroscope_bias"], accel + p["accelerometer_bias"]))
     return np.array(rows).transpose(1, 0, 2)
+
+
+def filtered_twin(x, times, bandwidth):
+    """A filter of first order, sample by sample: the response to a ramp over each interval."""
+    tau, rows = 1.0 / (2.0 * math.pi * bandwidth), [x[0]]
+    for i in range(1, len(x)):
+        h = times[i] - times[i - 1]
+        slope, a = (x[i] - x[i - 1]) / h, math.exp(-h / tau)
+        # y' = (u - y) / tau with u = x0 + slope s: the particular solution is u - slope tau.
+        rows.append(x[i] - slope * tau + a * (rows[-1] - (x[i - 1] - slope * tau)))
+    return np.array(rows)
 
 
 @pytest.mark.parametrize("averaging", [0, 2])
@@ -119,6 +144,63 @@ def test_the_chain_is_that_of_the_twin(averaging):
         gyro, accel = readings_twin(one, t.numpy(), own, averaging)
         np.testing.assert_allclose(out.gyroscope[item].numpy(), gyro, atol=1e-6)
         np.testing.assert_allclose(out.accelerometer[item].numpy(), accel, atol=1e-4)
+
+
+def test_every_effect_at_once():
+    trajectory, t, p = spline(order=6), stamps(9), parameters()
+    densities = {
+        "noise_density": (0.01, 0.02),
+        "random_walk": (0.03, 0.04),
+        "bias_sigma": (0.05, 0.06),
+        "bias_time": (5.0, 6.0),
+    }
+    six = {name: torch.tensor([g] * 3 + [a] * 3, dtype=F64) for name, (g, a) in densities.items()}
+    noise = {
+        f"{s}_{n}": both[i]
+        for n, both in densities.items()
+        for i, s in enumerate(("gyroscope", "accelerometer"))
+    }
+    sensor = imu.Imu(
+        **p, noise=imu.ImuNoise(**noise), rate=50.0, averaging=2, jitter=1e-3, drop_probability=0.3,
+        gyroscope_filter=imu.LowPass(3.0), accelerometer_filter=imu.LowPass(4.0), gyroscope_range=1.0,
+        accelerometer_range=12.0, gyroscope_resolution=0.01, accelerometer_resolution=0.05,
+    )  # fmt: skip
+    out = sensor(trajectory, t, generator=generator(5))
+
+    again, shape = generator(5), (9, 6)  # in the order in which the sensor draws
+    normals = imu.white_noise((9, 2), 1.0, 1.0, again, F32).to(F64)
+    walk = imu.random_walk(shape, six["random_walk"], t, again, F64)
+    driving = six["bias_sigma"] * (2.0 / six["bias_time"]).sqrt()
+    walk = walk + imu.gauss_markov(shape, driving, six["bias_time"], t, again, F64)
+    white = imu.white_noise(shape, six["noise_density"], 50.0, again, F64).numpy()
+    bias = (walk + torch.cat([p["gyroscope_bias"], p["accelerometer_bias"]])).numpy()
+    own = {name: x.numpy() for name, x in p.items()}
+    times = [
+        instant_twin(trajectory, float(s), own) + 1e-3 * float(n)
+        for s, n in zip(t, normals[:, 0], strict=True)
+    ]
+    exposed = [averaged_twin(trajectory, time, own, 2, 0.02) for time in times]
+    rate, force = (
+        filtered_twin(np.array(x), times, f)
+        for x, f in zip(zip(*exposed, strict=True), (3.0, 4.0), strict=True)
+    )
+    limit, step = np.repeat([1.0, 12.0], 3), np.repeat([0.01, 0.05], 3)
+    clipped = 0
+    for i in range(9):
+        read = np.concatenate(calibrated_twin(rate[i], force[i], own)) + bias[i] + white[i]
+        clipped += (np.abs(read) > limit).sum()
+        read = np.round(np.clip(read, -limit, limit) / step) * step
+        arrived = normals[i, 1] >= torch.special.ndtri(torch.tensor(0.3))
+        assert bool(out.valid[i]) == bool(arrived)
+        read = read if arrived else np.zeros(6)
+        np.testing.assert_allclose(out.gyroscope[i].numpy(), read[:3], atol=1e-12)
+        np.testing.assert_allclose(out.accelerometer[i].numpy(), read[3:], atol=1e-12)
+    assert clipped > 5
+    assert 0 < out.valid.sum() < 9
+    np.testing.assert_allclose(out.instants.numpy(), times, atol=1e-15)
+    np.testing.assert_allclose(
+        torch.cat([out.gyroscope_bias, out.accelerometer_bias], -1).numpy(), bias, atol=1e-15
+    )
 
 
 def test_without_any_effect_it_is_measure():
@@ -372,6 +454,17 @@ def test_range_and_resolution():
     steps = torch.tensor([0.5, 0.25, 0.125], dtype=F64)
     assert torch.equal(out.accelerometer / steps, (free.accelerometer / steps).round())
     assert ((out.accelerometer - free.accelerometer).abs() <= 0.5 * steps + 1e-12).all()
+
+
+def test_gradients_of_the_range():
+    trajectory, t = spline(), stamps(5)
+    limit = torch.tensor([1.0, 0.5, 2.0], dtype=F64, requires_grad=True)
+
+    def run(x):
+        return imu.Imu(gyroscope_range=x)(trajectory, t).gyroscope
+
+    assert (run(limit) == limit).any()
+    assert torch.autograd.gradcheck(run, (limit,))
 
 
 def test_gradients_pass_the_converter_straight_where_it_does_not_clip():

@@ -228,6 +228,22 @@ def test_steady_rates_and_shapes(mode):
         assert torch.allclose(single.double(), found, atol=1e-6)
 
 
+@MODES
+def test_transforms_and_compilation_of_gyroscope_integration(mode):
+    w, t = numbers(2, 6, 3), 0.1 * torch.arange(6, dtype=F64)
+    with use_kernels(mode):
+        expected = integrate_gyroscope(w, t)
+        mapped = torch.func.vmap(lambda x: integrate_gyroscope(x, t))(w)
+        assert torch.allclose(mapped, expected, rtol=0, atol=1e-14)
+        direction = numbers(2, 6, 3, seed=1)
+        _, rate = torch.func.jvp(lambda x: integrate_gyroscope(x, t), (w,), (direction,))
+        cotangent = numbers(2, 6, 4, seed=2)
+        (back,) = torch.autograd.grad((integrate_gyroscope(w.requires_grad_(), t) * cotangent).sum(), w)
+        assert (rate * cotangent).sum().item() == pytest.approx((back * direction).sum().item(), rel=1e-9)
+        compiled = torch.compile(integrate_gyroscope, fullgraph=True, backend="eager")
+        assert torch.allclose(compiled(w.detach(), t), expected, rtol=0, atol=1e-14)
+
+
 # ---------------------------------------------------------------------- shapes, gradients
 
 

@@ -1,6 +1,7 @@
 """Inertial measurement units on trajectories."""
 
 from torchspline.imu import earth
+from torchspline.imu.allan import AllanDeviation, NoiseEstimate, allan_deviation, fit_noise
 from torchspline.imu.ambient import AmbientReadings, Barometer, Magnetometer
 from torchspline.imu.filters import LowPass
 from torchspline.imu.increments import Increments, compensate, increments, sampled_increments
@@ -12,6 +13,7 @@ from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading, measure
 
 __all__ = [
     "STANDARD_GRAVITY",
+    "AllanDeviation",
     "AmbientReadings",
     "Barometer",
     "Imu",
@@ -21,9 +23,12 @@ __all__ = [
     "LowPass",
     "Magnetometer",
     "Navigation",
+    "NoiseEstimate",
     "Readings",
+    "allan_deviation",
     "compensate",
     "earth",
+    "fit_noise",
     "flicker_noise",
     "gauss_markov",
     "increments",

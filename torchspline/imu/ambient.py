@@ -11,7 +11,7 @@ from torchspline.groups.group import SO3
 from torchspline.imu.earth import standard_pressure
 from torchspline.imu.filters import LowPass
 from torchspline.imu.noise import Generators, random_walk, white_noise
-from torchspline.imu.parts import above_zero, along_time, keep, mean_rate, tensor_of, times_of
+from torchspline.imu.parts import above_zero, along_time, drawing_device, keep, mean_rate, tensor_of, times_of
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling
 from torchspline.splines.trajectory import Kinematics, Trajectory
@@ -110,15 +110,18 @@ class _Ambient(nn.Module):
         ]
         batches = [x.shape[:-2] for x in (signal, bias, *densities) if x is not None]
         batch = torch.broadcast_shapes(*batches, valid.shape[:-1])
-        if isinstance(generator, (list, tuple)) and not batch:
+        if isinstance(generator, Sequence) and not batch:
             batch = torch.Size([len(generator)])
         shape = (*batch, at.shape[-1], self.channels)
         white, walk = densities
+        home = drawing_device(generator, signal.device)
         if white is not None:
             rate = mean_rate(at) if self.rate is None else self.rate
-            signal = signal + white_noise(shape, white, rate, generator, signal.dtype)
+            drawn = white_noise(shape, white.to(home), rate, generator, signal.dtype)
+            signal = signal + drawn.to(signal.device)
         if walk is not None:
-            bias = bias + random_walk(shape, walk, at, generator, signal.dtype)
+            drawn = random_walk(shape, walk.to(home), at.to(home), generator, signal.dtype)
+            bias = bias + drawn.to(signal.device)
         signal = signal + bias
         if self.range is not None:
             signal = saturate(signal, along_time(self.range, signal))

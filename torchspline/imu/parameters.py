@@ -18,7 +18,7 @@ _MICRO_G = 9.80665e-6
 class ImuNoise:
     """Densities of an IMU's noise, in the units of Kalibr's `imu.yaml` and EuRoC's `sensor.yaml`; 0: there is none.
 
-    Each is a number, (3,), or (*batch, 3) for IMUs of a batch; a tensor that requires grad is used as given.
+    Each is a number, (3,) numbers, or (*batch, 3) for IMUs of a batch; a tensor that requires grad is used as given.
 
     Attributes:
         gyroscope_noise_density, accelerometer_noise_density: white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). A sample
@@ -48,6 +48,8 @@ class ImuNoise:
             if x is None:
                 raise TypeError(f"{field.name}: expected a number or a tensor, got None; 0 means none")
             above_zero(field.name, x, zero_too=not field.name.endswith("_time"))
+            if not isinstance(getattr(self, field.name), (int, float, Tensor)):  # a sequence
+                object.__setattr__(self, field.name, x)
 
     @classmethod
     def from_datasheet(

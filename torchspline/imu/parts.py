@@ -1,5 +1,6 @@
 """Keeping and checking the parameters that sensors are made of."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -101,3 +102,9 @@ def mean_rate(t: Tensor) -> float:
     if not seconds > 0:
         raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
     return (t.shape[-1] - 1) / seconds
+
+
+def drawing_device(generator: Any, device: torch.device) -> torch.device:
+    """Where random numbers are drawn: where their generators are, so that a CPU's serve a GPU, too."""
+    first = generator[0] if isinstance(generator, Sequence) and len(generator) else generator
+    return first.device if isinstance(first, torch.Generator) else device

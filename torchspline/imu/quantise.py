@@ -6,7 +6,7 @@ from torch import Tensor
 
 def saturate(x: Tensor, limit: Tensor) -> Tensor:
     """`x` within [-limit, limit]. The gradient is that of the value: zero to `x` where it is clipped."""
-    return torch.minimum(torch.maximum(x, -limit), limit)
+    return torch.clamp(x, -limit, limit)
 
 
 def quantise(x: Tensor, step: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """When a sensor really samples: its clock, the jitter of its sampling, the samples that get lost."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor, nn
 
 from torchspline import checks
 from torchspline.imu.noise import Generators, white_noise
-from torchspline.imu.parts import above_zero, keep, tensor_of
+from torchspline.imu.parts import above_zero, drawing_device, keep, tensor_of
 from torchspline.splines.trajectory import Trajectory
 
 _NANOSECOND = 1e-9
@@ -96,12 +97,13 @@ class Sampling(nn.Module):
         valid = torch.ones((), dtype=torch.bool, device=t.device).expand(at.shape)
         if self.jitter is None and self.drop_probability is None:
             return Instants(at, valid)
-        if isinstance(generator, (list, tuple)) and not batch:
+        if isinstance(generator, Sequence) and not batch:
             batch = torch.Size([len(generator)])
         # Two columns whatever is used, so that one effect does not change the random numbers of another.
-        normals = white_noise((*batch, t.shape[-1], 2), 1.0, 1.0, generator, torch.float64).to(t.device)
+        one = torch.ones((), device=drawing_device(generator, t.device))
+        normals = white_noise((*batch, t.shape[-1], 2), one, one, generator, torch.float32).to(t.device)
         if self.jitter is not None:
-            at = excursion(trajectory, at, normals[..., 0] * _column(self.jitter))
+            at = excursion(trajectory, at, normals[..., 0].to(torch.float64) * _column(self.jitter))
         if self.drop_probability is not None:
             # A normal number lies below the quantile with just this probability.
             valid = normals[..., 1] >= torch.special.ndtri(_column(self.drop_probability))

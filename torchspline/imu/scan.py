@@ -37,13 +37,18 @@ def prefix(combine: Callable[[Element, Element], Element], steps: Element) -> El
     return tuple(results)
 
 
+def _usable(*tensors: Tensor) -> bool:
+    # First, as what the mode is kept in cannot be traced.
+    return not torch.compiler.is_compiling() and mode.usable(*tensors)
+
+
 def linear_recurrence(factors: Tensor, x: Tensor) -> Tensor:
     """`y_k = factors_k y_{k-1} + x_k`, `y_0 = x_0`, along dimension -2; differentiable in both to any order.
 
     Args:
         factors: broadcasts to the shape of x; those of the first sample are not used. x: (*batch, N, C).
     """
-    if not mode.usable(factors, x):
+    if not _usable(factors, x):
         return _linear_reference(factors, x)
     result: Tensor = _LinearRecurrence.apply(factors, x)
     return result
@@ -96,7 +101,7 @@ def rotation_products(start: Tensor, steps: Tensor) -> Tensor:
     Args:
         start: unit quaternions (*batch, 4). steps: (*batch, N, 4), unit quaternions.
     """
-    if not mode.usable(start, steps):
+    if not _usable(start, steps):
         return _products_reference(start, steps)
     result: Tensor = _RotationProducts.apply(start, steps)
     return result

@@ -23,7 +23,16 @@ from torchspline.imu.noise import (
     white_noise,
 )
 from torchspline.imu.parameters import ImuNoise
-from torchspline.imu.parts import above_zero, along_time, bias_of, keep, mean_rate, tensor_of, times_of
+from torchspline.imu.parts import (
+    above_zero,
+    along_time,
+    bias_of,
+    drawing_device,
+    keep,
+    mean_rate,
+    tensor_of,
+    times_of,
+)
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, excursion
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
@@ -215,7 +224,8 @@ class Imu(nn.Module):
                 item is the same in whichever batch it is drawn: `[item_generator(seed, i) for i in items]`.
         Returns:
             Readings: in `dtype`, on the trajectory's device.
-        Differentiable in the trajectory, float `t` and all parameters but rate and resolution.
+        Differentiable in the trajectory, float `t` and all parameters but rate and resolution. Where no gradient is
+        wanted of the motion and of where the IMU sits (`learnable=False`, or `torch.no_grad()`), it is far faster.
         Raises:
             TypeError, ValueError: a wrong type, shape or value, times outside the domain, or a trajectory without
                 rotation or position.
@@ -236,7 +246,7 @@ class Imu(nn.Module):
             signal = signal @ matrix.mT
         bias, white = self._disturbances(signal, at, instants, generator)
         batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], valid.shape[:-1])
-        signal = signal + bias
+        signal = _plus(signal, bias)
         if white is not None:
             signal = _plus(signal, white)
         signal = self._converted(signal)
@@ -392,33 +402,36 @@ class Imu(nn.Module):
             both = [getattr(self, f"{sensor}_{name}") for sensor in ("gyroscope", "accelerometer")]
             if not any(isinstance(x, Tensor) or x for x in both):
                 return None
-            triads = [tensor_of(name, x, (3,), "") for x in both]
-            return _joined(*(along_time(x, signal) for x in triads if x is not None))
+            both = [x if isinstance(x, Tensor) else signal.new_full((3,), x) for x in both]
+            both = [along_time(x.expand(3) if x.ndim == 0 else x, signal) for x in both]
+            return _joined(*both).to(home)
 
+        home = drawing_device(generator, signal.device)
+        t = at.to(home)
         densities = {
             name: density(name)
             for name in ("noise_density", "random_walk", "bias_sigma", "bias_time", "bias_instability")
         }
         known = [x.shape[:-2] for x in densities.values() if x is not None]
         batch = torch.broadcast_shapes(signal.shape[:-2], bias.shape[:-2], *known)
-        if isinstance(generator, (list, tuple)) and not batch:
+        if isinstance(generator, Sequence) and not batch:
             batch = torch.Size([len(generator)])
         shape = (*batch, at.shape[-1], 6)
-        white = None
-        if densities["noise_density"] is not None:
-            white = white_noise(shape, densities["noise_density"], self._rate(at), generator, signal.dtype)
-        if densities["random_walk"] is not None:
-            bias = _plus(random_walk(shape, densities["random_walk"], at, generator, signal.dtype), bias)
-        if densities["bias_sigma"] is not None:
-            time = densities["bias_time"]
-            assert time is not None
-            driving = densities["bias_sigma"] * (2.0 / time).sqrt()
-            bias = _plus(gauss_markov(shape, driving, time, at, generator, signal.dtype), bias)
-        if densities["bias_instability"] is not None:
-            bias = _plus(
-                flicker_noise(shape, densities["bias_instability"], at, generator, signal.dtype), bias
-            )
-        return bias, white
+        walks = []
+        if (walk := densities["random_walk"]) is not None:
+            walks.append(random_walk(shape, walk, t, generator, signal.dtype))
+        if (sigma := densities["bias_sigma"]) is not None and (time := densities["bias_time"]) is not None:
+            driving = sigma * (2.0 / time).sqrt()
+            walks.append(gauss_markov(shape, driving, time, t, generator, signal.dtype))
+        if (level := densities["bias_instability"]) is not None:
+            walks.append(flicker_noise(shape, level, t, generator, signal.dtype))
+        for x in walks:
+            bias = _plus(x.to(signal.device), bias)
+        own = densities["noise_density"]
+        if own is None:
+            return bias, None
+        white = white_noise(shape, own, self._rate(at), generator, signal.dtype)
+        return bias, white.to(signal.device)
 
     def _converted(self, signal: Tensor) -> Tensor:
         limit = self._pair("range", signal, torch.inf)
