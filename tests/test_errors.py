@@ -26,7 +26,7 @@ from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
 IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
-CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
+CASES = [*error_online.CASES, *error_generate.CASES, *(case for more in IMU for case in more.CASES)]
 
 
 def label(case: Case) -> str:
@@ -229,7 +229,7 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, *IMU):
+for _more in (error_online, error_generate, *IMU):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
         NOT_APPLICABLE[_category].update(_reasons)
 
