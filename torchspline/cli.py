@@ -346,7 +346,7 @@ def main() -> None:
     arguments = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:
         status = CLI(commands, args=arguments, prog="torchspline")
-    except (TypeError, ValueError, OSError, MemoryError) as error:
+    except (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2
     sys.exit(status)

@@ -94,7 +94,7 @@ class Calibrator(nn.Module):
         self.log_rate = nn.Parameter(torch.tensor([5.0, 2.72]).log())
         # Those of biases and scales of sensors (gyroscope, then accelerometer).
         self.log_priors = nn.Parameter(torch.tensor([0.05, 0.003, 0.05, 0.003]).log())
-        # A gyroscope that is good in two axes is good in the third: the prior of later steps.
+        # A gyroscope that is good about two axes is good about the third: the prior of later steps.
         self.log_good = nn.Parameter(torch.tensor(0.002).log())
         self.log_alike = nn.Parameter(torch.tensor(0.0))
         # Of the filter that takes noise off the readings.
@@ -151,7 +151,11 @@ class Calibrator(nn.Module):
         # Priors hold for the whole calibration rather than for this step.
         information = (-2.0 * self.log_priors).exp().to(H).expand(len(H), -1)
         if not first:
-            size_of_bias = now.gyroscope_bias.square().mean(-1)
+            # Mean square of the bias in the directions that the data tell something about.
+            bias, known = now.gyroscope_bias, H[:, :3, :3]
+            size_of_bias = (bias * (known @ bias[..., None])[..., 0]).sum(-1) / known.diagonal(
+                dim1=-2, dim2=-1
+            ).sum(-1)
             good = (2.0 * self.log_good).exp() + self.log_alike.exp() * size_of_bias
             information = torch.cat([1.0 / good[:, None], information[:, 1:]], -1)
         information = information.repeat_interleave(3, -1)
