@@ -27,6 +27,8 @@ GROUP = 20
 GRAVITY = 9.80665
 #: Unknowns that are a stretch's own (u and v0), and all sensor parameters (biases and scales of both).
 LOCAL, SHARED = 6, 12
+#: What a step changes at most, rad/s and m/s^2: so that a stretch that was misjudged does not lose the way.
+STEPS = (0.2, 0.05, 1.0, 0.05)
 #: Of an instant, for the network.
 FEATURES = 5
 #: Instants in a second, odd.
@@ -49,8 +51,10 @@ class Calibration(NamedTuple):
         return cls(zero, one, zero, one)
 
     def plus(self, step: Tensor) -> "Calibration":
-        """With the corrections db, ds, dc, da, (B, 12)."""
-        db, ds, dc, da = step.split(3, -1)
+        """With the corrections db, ds, dc, da, (B, 12), of which no step takes more than STEPS."""
+        db, ds, dc, da = (
+            most * torch.tanh(x / most) for x, most in zip(step.split(3, -1), STEPS, strict=True)
+        )
         return Calibration(
             self.gyroscope_bias + db, self.gyroscope_scale + ds,
             self.accelerometer_bias + dc, self.accelerometer_scale + da,

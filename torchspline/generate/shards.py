@@ -47,7 +47,8 @@ def write(
 
     Under `torchrun` every process writes the shards whose number, divided by the number of processes, leaves its rank.
     A file appears under its name once it is complete and on disk, so a process may be killed at any time. The same
-    recipe, seed and versions of the libraries make the same bytes, whatever the number of processes and interruptions.
+    recipe, seed and versions of the libraries make the same bytes on the same kind of processor, whatever the number of
+    processes and interruptions.
 
     Args:
         recipe: what items are drawn from. seed: of all random numbers, 0 or more.
