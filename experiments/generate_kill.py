@@ -66,7 +66,7 @@ def killed(arguments: list[str], out: Path, wait: float) -> Run:
 
 
 def descendants(pid: int) -> list[int]:
-    """Processes that a process has started, and those that they have: torchrun's are in sessions of their own."""
+    """Processes that a process has started, and those that they have: torchrun's are in groups of their own."""
     children: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
