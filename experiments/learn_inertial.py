@@ -4,8 +4,9 @@ A network (`learning/estimator.py`) that has seen nothing but generated motions 
 accelerometer of a real recording. With the biases and scales that it finds, readings are corrected through the sensor
 model and the gyroscope is integrated; poses serve to measure errors, of 1 s, 5 s and 10 s and of the whole run from its
 first pose on, and for nothing else. Compared with: no correction; the mean of the stillest second among the first 20 as
-bias (the usual practice, which needs a rest); the same least squares without a network and training; and the best
-constant bias that poses can tell, which bounds what a constant correction of the bias can do.
+bias (the usual practice, which needs a rest); the same least squares without a network and training; and the constant
+bias that the poses themselves tell, about the most that can be had. No parameter was trained on these recordings, but
+they were looked at while motions, sensors and the network were chosen.
 """
 
 import tempfile
@@ -17,7 +18,7 @@ from typing import Any
 import torch
 from common import ROOT, Table, run, save, show
 from learning.estimator import GROUP, Calibration, Calibrator
-from learning.evaluation import Errors, best_bias, orientation_errors, rms, stillest
+from learning.evaluation import Errors, bias_from_poses, orientation_errors, rms, stillest
 from learning.training import LAGS, Training, batches, train, train_in_processes
 from matplotlib.figure import Figure
 from recordings.load import Recording, load
@@ -143,12 +144,14 @@ def experiment(
                 orientation_errors(recording, corrected(recording, c, only_bias, model if denoise else None))
                 for c, (model, _) in zip(calibrations, trained, strict=True)
             ]
-        errors[name]["best constant bias"] = [orientation_errors(recording, raw - best_bias(recording))]
+        errors[name]["bias from the poses"] = [
+            orientation_errors(recording, raw - bias_from_poses(recording))
+        ]
         found[name] = {
             "gyroscope_bias": [c.gyroscope_bias[0] for c in calibrations],
             "gyroscope_scale": [c.gyroscope_scale[0] for c in calibrations],
             "accelerometer_bias": [c.accelerometer_bias[0] for c in calibrations],
-            "best_constant_bias": best_bias(recording),
+            "bias_from_poses": bias_from_poses(recording),
             "stillest_second": stillest(recording),
         }
     show(out, [*_tables(errors, seeds), _about(noise, difference, process_steps)])
@@ -217,7 +220,7 @@ def _figure(errors: dict[str, dict[str, list[Errors]]], losses: list[list[float]
     lines = -(-count // 3)
     figure = Figure(figsize=(13, 3.6 * lines), layout="constrained")
     panels = figure.subplots(lines, 3, squeeze=False).flatten()
-    colors = {"none": "0.5", "stillest second": "C0", "network": "C3", "best constant bias": "C2"}
+    colors = {"none": "0.5", "stillest second": "C0", "network": "C3", "bias from the poses": "C2"}
     for axes, (name, methods) in zip(panels, errors.items(), strict=False):
         for method, color in colors.items():
             for i, e in enumerate(methods[method]):
@@ -227,7 +230,7 @@ def _figure(errors: dict[str, dict[str, list[Errors]]], losses: list[list[float]
                 )  # fmt: skip
         axes.set(title=name, xlabel="time [s]", ylabel="angle [deg]", ylim=(0.05, 200))
         axes.grid(alpha=0.3)
-    panels[0].legend(title="correction", fontsize=8, loc="lower right")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     for x in losses:
         panels[count - 1].plot(x, color="C3", linewidth=1)
     panels[count - 1].set(title="training on generated data", xlabel="step", ylabel="loss")

@@ -142,9 +142,15 @@ class Calibrator(nn.Module):
         first: bool,
     ) -> Tensor:
         h = GROUP * dt
-        rate, force = (grouped(x) for x in now.correct(gyroscope, accelerometer))
+        corrected = now.correct(gyroscope, accelerometer)
+        rate, force = (grouped(x) for x in corrected)
+        # At the full rate, because small vibrations about several axes add up to rotations.
+        t = dt * torch.arange(gyroscope.shape[1], dtype=torch.float64)
+        rotation = imu.integrate_gyroscope(corrected.gyroscope, t)
+        turned = grouped(SO3.act(rotation, corrected.accelerometer, validate=False))
+        middle = rotation[:, GROUP // 2 :: GROUP]
         size = min(round(length / h), rate.shape[1])
-        H, right = self._velocity(*(stretches(x, size) for x in (rate, force)), h, weights)
+        H, right = self._velocity(*(stretches(x, size) for x in (rate, force, turned, middle)), h, weights)
         # Bodies turn to and fro, and some of the time they rest.
         if weights is None:
             still = torch.ones_like(rate[..., :1])
@@ -175,11 +181,22 @@ class Calibrator(nn.Module):
         return torch.linalg.solve(H + torch.diag_embed(information), right - information * so_far)
 
     def _velocity(
-        self, rate: Tensor, force: Tensor, h: float, weights: Tensor | None
+        self,
+        rate: Tensor,
+        force: Tensor,
+        turned: Tensor,
+        rotation: Tensor,
+        h: float,
+        weights: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Normal equations of the sensor's parameters, (B, 12, 12) and (B, 12), from stretches (B, S, K, 3)."""
-        R = SO3.to_matrix(orientations(rate, h), validate=False)
-        turned = R @ force[..., None]
+        """Normal equations of the sensor's parameters, (B, 12, 12) and (B, 12), from stretches (B, S, K, 3 or 4).
+
+        Args:
+            turned: the readings `force` in the frame of `rotation`; here all turn into that of a stretch's middle.
+        """
+        back = SO3.inverse(rotation[:, :, rotation.shape[2] // 2, None], validate=False)
+        R = SO3.to_matrix(SO3.compose(back, rotation, validate=False), validate=False)
+        turned = SO3.act(back, turned, validate=False)[..., None]
         u = GRAVITY * F.normalize(turned.mean(2, keepdim=True), dim=-2)
         cross = skew(u[..., 0])
 
@@ -252,15 +269,6 @@ def stretches(x: Tensor, size: int) -> Tensor:
     """(B, K, C) cut into (B, S, size, C); what is left over at the end is dropped."""
     count = x.shape[1] // size
     return x[:, : count * size].unflatten(1, (count, size))
-
-
-def orientations(rate: Tensor, h: float) -> Tensor:
-    """Rotations (..., K, 4) in the middle of each of K intervals of h s, identity in the middle of them all."""
-    turned = running(SO3.exp(h * rate, validate=False))
-    half = SO3.exp(0.5 * h * rate, validate=False)
-    middles = SO3.compose(turned, SO3.inverse(half, validate=False), validate=False)
-    center = middles[..., middles.shape[-2] // 2, None, :]
-    return SO3.compose(SO3.inverse(center, validate=False), middles, validate=False)
 
 
 def running(steps: Tensor) -> Tensor:

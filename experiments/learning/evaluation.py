@@ -55,8 +55,8 @@ def orientation_errors(recording: Recording, gyroscope: Tensor) -> Errors:
     return Errors(lags, rms(angle), rms(tilt), (at - origin).to(torch.float64) / SECOND, angle)
 
 
-def best_bias(recording: Recording) -> Tensor:
-    """The mean difference between the gyroscope and the rates of the poses: the best that a constant bias can do."""
+def bias_from_poses(recording: Recording) -> Tensor:
+    """The median difference between the gyroscope and the mean rates of the poses."""
     stamps, poses = recording.samples.time_ns, usable(recording.poses)
     rotation = imu.integrate_gyroscope(recording.samples.gyroscope, stamps)
     at, true = _on_grid(poses, int(stamps[0]), int(stamps[-1]))
