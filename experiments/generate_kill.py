@@ -163,6 +163,7 @@ def _figure(runs: list[Run], total: int) -> Figure:
         ylim=0,
     )
     axes.legend()
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     return figure
 
