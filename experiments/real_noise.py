@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from common import Table, run, save, show
+from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
 from recordings.load import SECOND, Recording, load, longest_stretch
 from scipy.signal import welch
@@ -143,9 +143,9 @@ def residual(
 
 
 def spectrum(t: Tensor, x: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Square root of the two-sided density, which is the density of white noise; pieces of two seconds or a quarter."""
+    """Square root of the two-sided density, the density of white noise; pieces of a second or a quarter of all."""
     rate = (len(t) - 1) / (t[-1] - t[0]).item()
-    f, power = welch(x.numpy(), rate, nperseg=min(len(t) // 4, round(2 * rate)), axis=0)
+    f, power = welch(x.numpy(), rate, nperseg=min(len(t) // 4, round(rate)), axis=0)
     return f[1:], np.sqrt(0.5 * power[1:])
 
 
@@ -196,7 +196,7 @@ def experiment(
         spacing: knots of the fitted motion, ms.
         seed: of the simulated noise.
     """
-    folder = Path(__file__).resolve().parent.parent / data
+    folder = ROOT / data
     found, rows, figures = {}, [], {}
     for i, name in enumerate([*rest, *moving]):
         recording = load(folder, name, seed)

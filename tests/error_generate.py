@@ -32,6 +32,11 @@ ACCEPTED.update(
     }
 )
 
+#: Where test_errors.py looks for public functions; what it finds that nobody is meant to call; what has no arguments.
+ROOTS = (generate,)
+RESULTS = ("Written",)
+UNTRIED = {"Recipe.as_dict": "no arguments"}
+
 _ALL = "random_motion Recipe GeneratedDataset items_per_block write read ShardedDataset"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE: dict[str, dict[str, str]] = {

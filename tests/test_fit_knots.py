@@ -1,12 +1,13 @@
 """Which spacing changes between neighbouring fits speak for."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchspline import SO3, fit_poses
-from torchspline.fit.knots import _least
+from torchspline.fit.knots import Knots, _least, choose_spacing
 
-RATIO = 2**0.5
+RATIO = 2**0.25
 
 
 @pytest.mark.parametrize(
@@ -16,18 +17,52 @@ RATIO = 2**0.5
         ([8.0, 4.0, 2.0, 1.0, 2.0, 4.0, 8.0], 3),
         # Wide fits agree on missing the motion.
         ([8.0, 4.0, 2.0, 1.0, 2.0, 4.0, 2.0, 0.5, 0.1], 3),
-        # Motion of all frequencies: changes level out, and fall again where nothing is left to miss.
-        ([8.0, 4.0, 2.0, 1.8, 1.6, 1.4, 1.0, 0.7, 0.5, 0.3, 0.1], 2),
         # Smooth noise does not show between narrow spacings.
         ([1.0, 1.1, 1.4, 1.5, 3.0, 6.0], 3),
     ],
 )
 def test_the_first_minimum_counts(changes, best):
-    tried = [RATIO**i for i in range(len(changes) + 1)]
+    tried = [RATIO**i for i in range(len(changes) + 2)]
     spacing, change = _least(tried, changes)
-    assert change == changes[best]
+    assert change == pytest.approx(changes[best])
     # The parabola moves it by half a step at most.
-    assert RATIO**best * 0.999 < spacing < RATIO ** (best + 1) * 1.001
+    assert RATIO ** (best + 0.5) * 0.999 < spacing < RATIO ** (best + 1.5) * 1.001
+
+
+@pytest.mark.parametrize("noise_slope", [0.4, 0.6])
+@pytest.mark.parametrize("motion_slope", [0.0, 0.05])
+def test_where_the_noise_ends_well_before_the_least_change(noise_slope, motion_slope):
+    """Motion of all frequencies: changes level out, and fall again where nothing is left to miss."""
+    steps = np.arange(30)
+    noise, motion = np.exp(-noise_slope * (steps - 12)), np.exp(-motion_slope * np.maximum(steps - 12, 0))
+    changes = np.sqrt(noise**2 + motion**2) * np.where(steps > 25, np.exp(-0.5 * (steps - 25)), 1.0)
+    spacing, _ = _least([RATIO**i for i in range(32)], changes.tolist())
+    assert 11.5 < np.log(spacing) / np.log(RATIO) - 1 < 14.5  # equal at 12
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_nearly_as_good_as_the_best_of_many_spacings(seed):
+    """Positions with motion of all frequencies below 5 Hz, and white noise."""
+    rng = np.random.default_rng(seed)
+    t = torch.arange(0, 20, 1 / 120, dtype=torch.float64)
+    frequency, phase = 2 * np.pi * rng.uniform(0.2, 5.0, (3, 12)), rng.uniform(0, 2 * np.pi, (3, 12))
+    waves = (
+        rng.normal(size=(3, 12))
+        / frequency**1.5
+        * np.exp(1j * (t.numpy()[:, None, None] * frequency + phase))
+    )
+    position, acceleration = waves.imag.sum(-1), (-(frequency**2) * waves.imag).sum(-1)
+    measured = torch.from_numpy(position + 1e-3 * rng.normal(size=position.shape))
+    poses = torch.cat([measured, SO3.identity(len(t), dtype=torch.float64)], -1)
+    inside = slice(60, -60)
+
+    def error(dt):
+        knots = Knots(t, dt, 6)
+        fitted = knots.evaluate(knots.linear_fit(t, measured.numpy(), 1e-9), t[inside], derivative=2)
+        return np.sqrt(np.square(fitted - acceleration[inside]).mean())
+
+    chosen = choose_spacing(t, poses, 6, 1e-9, None).position
+    assert error(chosen) < 1.2 * min(error(0.02 * RATIO**i) for i in range(14))
 
 
 def test_bursts_do_not_ask_for_knots_between_them():

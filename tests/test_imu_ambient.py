@@ -82,9 +82,11 @@ def test_gradients():
 
     zero = torch.zeros((), dtype=F64)
     inputs = [x.clone().requires_grad_() for x in (FIELD, zero, *given.values())]
-    assert torch.autograd.gradcheck(magnetic, inputs, fast_mode=True)
+    assert torch.autograd.gradcheck(magnetic, inputs, fast_mode=True, check_forward_ad=True)
     inputs = [x.clone().requires_grad_() for x in (zero, normal(3), zero, zero)]
-    assert torch.autograd.gradcheck(pressure, inputs, eps=1e-4, atol=1e-4, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        pressure, inputs, eps=1e-4, atol=1e-4, fast_mode=True, check_forward_ad=True
+    )
 
 
 def test_noise_walk_converter_and_losses():

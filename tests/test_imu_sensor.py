@@ -237,9 +237,8 @@ def test_gradients_of_every_parameter(name):
     points = trajectory.control_points.detach()
 
     def run(x):
-        moved = BSpline(
-            points + x if name == "control_points" else points, group=SPLIT, order=5, dt=0.1, t0=-0.2
-        )
+        moved = points + x if name == "control_points" else points
+        moved = BSpline(moved, group=SPLIT, order=5, dt=0.1, t0=-0.2, learnable=False)
         given = {**p, **({name: x} if name in p else {})}
         sensor = imu.Imu(
             **given, averaging=2, rate=50.0, gyroscope_filter=low_pass, accelerometer_filter=low_pass
@@ -248,7 +247,7 @@ def test_gradients_of_every_parameter(name):
         return out.gyroscope, out.accelerometer
 
     x = {"control_points": torch.zeros_like(points), "t": torch.zeros(3, dtype=F64), **p}[name]
-    assert torch.autograd.gradcheck(run, (x.clone().requires_grad_(),), fast_mode=True)
+    assert torch.autograd.gradcheck(run, (x.clone().requires_grad_(),), fast_mode=True, check_forward_ad=True)
 
 
 def test_gradients_of_the_noise():
@@ -267,7 +266,7 @@ def test_gradients_of_the_noise():
         return out.gyroscope, out.accelerometer, out.gyroscope_bias
 
     inputs = [torch.full((3,), 0.5, dtype=F64, requires_grad=True) for _ in names]
-    assert torch.autograd.gradcheck(run, inputs, fast_mode=True)
+    assert torch.autograd.gradcheck(run, inputs, fast_mode=True, check_forward_ad=True)
 
 
 def test_what_is_learnt_is_among_the_parameters():
@@ -476,6 +475,13 @@ def test_gradients_pass_the_converter_straight_where_it_does_not_clip():
     assert torch.equal(bias.grad, inside.sum(0).to(F64))
     assert not inside.all()
 
+    def run(bias):
+        sensor = imu.Imu(gyroscope_bias=bias, gyroscope_range=2.0, gyroscope_resolution=0.3)
+        return sensor(trajectory, t).gyroscope.sum(0)
+
+    _, forward = torch.func.jvp(run, (bias.detach(),), (torch.ones(3, dtype=F64),))
+    assert torch.equal(forward, inside.sum(0).to(F64))
+
 
 # ---------------------------------------------------------------------- compiled loops
 
@@ -519,3 +525,18 @@ def test_increments_are_those_of_the_motion(averaging):
     for coarse, fine, size in zip(*errors, sizes, strict=True):
         assert fine < 1e-2 * size
         assert coarse / fine > 6.0  # of third order at least
+
+
+@pytest.mark.parametrize("name", parameters())
+def test_vmap_over_a_parameter_is_a_loop(name):
+    trajectory, t, p = spline(), stamps(5), parameters()
+    low_pass = imu.LowPass(3.0, 2)
+
+    def run(x):
+        sensor = imu.Imu(**{**p, name: x}, averaging=1, gyroscope_filter=low_pass, gyroscope_range=2.0)
+        out = sensor(trajectory, t)
+        return out.gyroscope, out.accelerometer
+
+    batch = torch.stack([p[name], p[name] + 1e-3])
+    for mapped, one, two in zip(torch.func.vmap(run)(batch), run(batch[0]), run(batch[1]), strict=True):
+        assert torch.allclose(mapped, torch.stack([one, two]), rtol=0, atol=1e-12)

@@ -20,8 +20,8 @@ LAYERS = [
     {"splines"},
     {"imu"},
     {"fit"},
-    {"functional", "robot", "io", "plot"},
-    {"generate"},
+    {"functional", "robot", "people", "io", "plot"},
+    {"cli_body", "generate"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

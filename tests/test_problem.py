@@ -58,7 +58,8 @@ def test_orders(order, group):
     problem.add(
         Gyroscope(t, normal(20, 3, seed=1), bias=Variable("bias", torch.zeros(3, dtype=torch.float64)))
     )
-    problem.add(Accelerometer(t, normal(20, 3, seed=2), sigma=0.1))
+    if order > 2:
+        problem.add(Accelerometer(t, normal(20, 3, seed=2), sigma=0.1))
     problem.add(Pose(t, SE3.random(20, generator=generator(3))))
     check_assembly(problem)
 
@@ -197,6 +198,21 @@ def test_a_residual_that_is_refused_leaves_no_trace():
         problem.add(Accelerometer(t, normal(9, 3, seed=1), **new))
     assert list(problem.variables) == ["bias"]
     assert len(problem.residuals) == 1
+
+
+def test_derivatives_that_a_spline_does_not_have_are_refused():
+    spline = trajectory(SE3, order=2)
+    with pytest.raises(
+        ValueError, match=r"Accelerometer depends on the derivative number 2.*expected order 3"
+    ):
+        Problem(spline).add(Accelerometer(spread(spline, 5), normal(5, 3, seed=1)))
+
+
+def test_control_points_made_in_inference_mode_are_refused():
+    with torch.inference_mode():
+        spline = trajectory(SE3)
+    with pytest.raises(ValueError, match=r"trajectory: .*torch\.inference_mode.*clone"):
+        Problem(spline)
 
 
 def test_names_that_reports_give_to_splines_are_refused():

@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `torchspline imu`, `torchspline generate`, `torchspline kernels show`."""
+"""The command line: `torchspline demo`, `imu`, `body`, `generate`, `kernels show`."""
 
 import json
 import math
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from torchspline.cli_body import body
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.generate.command import generate
 from torchspline.groups import SO3, Group
@@ -341,7 +342,7 @@ def main() -> None:
     """Entry point of the `torchspline` command."""
     from jsonargparse import CLI
 
-    commands = {"demo": demo, "imu": imu, "generate": generate, "kernels": {"show": show}}
+    commands = {"demo": demo, "imu": imu, "body": body, "generate": generate, "kernels": {"show": show}}
     # A truth value takes a word of its own, but nobody types one after --json.
     arguments = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:

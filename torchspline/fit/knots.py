@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,21 +13,21 @@ from torchspline.splines.basis import blending_matrix, derivative_matrix
 from torchspline.splines.clock import locate
 
 _NANOSECONDS = 1_000_000_000
-#: Neighbouring spacings that are compared differ by this factor.
-_RATIO = 2**0.5
+#: Spacings that are tried follow each other by this factor; fits two of them apart are compared.
+_RATIO = 2**0.25
 #: Fewest poses a knot interval that are tried, and knot intervals.
 _LEAST_POSES, _LEAST_INTERVALS = 1.5, 6
 #: How often worse than the best so far ends the search.
 _GIVE_UP = 5.0
-#: A minimum is one if what follows rises by this factor; falling by no more than this factor twice in a row is level.
-_RISE, _LEVEL = 1.5, 0.8
-#: Spacings from level ground to the minimum at least, if it is to count for more.
+#: A minimum is one if what follows rises by this factor.
+_RISE = 1.5
+#: The fall of changes is over where it has slowed to this share of its steepest. With noise and missed motion alike, if
+#: the latter changes little with the spacing, it would be a half.
+_SLOWED = 0.4
+#: Spacings from there to the minimum at least, if it is to count for more.
 _WELL_BEFORE = 3
 #: Changes within this factor of the least count as alike.
 _ALIKE = 1.7
-#: The fits agree best about here, but the acceleration of the narrower one is nearer to the truth: in what it misses
-#: the wider one is off by a multiple. Found on recordings with an IMU beside the poses.
-_NARROWER = 0.7
 
 
 class Knots:
@@ -135,9 +134,9 @@ def choose_spacing(
     """Spacings that suit the data, from banded linear fits of the stored numbers at many spacings.
 
     A spline with knots too near follows the noise, one with knots too far misses motion; both show as a difference
-    between the fits at two neighbouring spacings, one falling with the spacing and one rising. Where the sum is least,
-    the error of a fit is about least, too [Lepski 1991]. Compared is what an IMU would see: rates of rotation, and
-    accelerations. Nothing has to be known about the noise.
+    between the fits at two near spacings, one falling with the spacing and one rising. Where the sum is least, or where
+    its fall comes to an end well before, the error of a fit is about least, too [Lepski 1991]. Compared is what an IMU
+    would see: rates of rotation, and accelerations. Nothing has to be known about the noise.
 
     Args:
         times: (N,) in order. measured: (N, 7) of continuous sign.
@@ -154,7 +153,7 @@ def choose_spacing(
     tried: list[float] = []
     misses: list[tuple[float, float]] = []
     changes: list[tuple[float, float]] = []
-    before: tuple[FloatArray, FloatArray] | None = None
+    before: list[tuple[FloatArray, FloatArray]] = []
     spacing = narrow
     # Ends and the surroundings of gaps, where little holds the curve, do not count.
     inside = _well_inside(times, unit, narrow)
@@ -168,8 +167,8 @@ def choose_spacing(
         )
         tried.append(spacing)
         misses.append((_per_axis(residual[:, :3]), _per_axis(residual[:, 3:])))
-        if before is not None:
-            changes.append((_per_axis(here[0] - before[0]), _per_axis(here[1] - before[1])))
+        if len(before) == 2:
+            changes.append((_per_axis(here[0] - before[0][0]), _per_axis(here[1] - before[0][1])))
             if accuracy is None and all(
                 now > _GIVE_UP * min(c)
                 for now, c in zip(changes[-1], zip(*changes, strict=True), strict=True)
@@ -179,7 +178,7 @@ def choose_spacing(
             now > _GIVE_UP * limit for now, limit in zip(misses[-1], accuracy, strict=True)
         ):
             break
-        before, spacing = here, spacing * _RATIO
+        before, spacing = [*before[-1:], here], spacing * _RATIO
     if accuracy is not None:
         return _widest_within(tried, misses, accuracy)
     if not changes:
@@ -187,11 +186,9 @@ def choose_spacing(
             tried[0], tried[0], f"too few poses to compare spacings: {tried[0] * 1e3:.3g} ms, the narrowest"
         )
     (rotation, turns), (position, pulls) = (_least(tried, [c[i] for c in changes]) for i in (0, 1))
-    position *= _NARROWER
     reason = (
-        f"fits at neighbouring spacings agree best at {rotation * 1e3:.3g} ms in angular velocity (to "
-        f"{turns:.3g} rad/s) and at {position * 1e3:.3g} ms in acceleration (to "
-        f"{pulls:.3g} m/s^2)"
+        f"judged by how fits at near spacings differ, {rotation * 1e3:.3g} ms suit angular velocity (difference "
+        f"{turns:.3g} rad/s) and {position * 1e3:.3g} ms acceleration ({pulls:.3g} m/s^2)"
     )
     return Spacing(rotation, position, reason)
 
@@ -220,41 +217,49 @@ def _well_inside(times: Tensor, unit: float, narrow: float) -> Tensor:
 
 
 def _least(tried: list[float], changes: list[float]) -> tuple[float, float]:
-    """The spacing of least change, between the two that were compared, and that change; a parabola through three finds
-    it."""
-    middles = np.log([math.sqrt(a * b) for a, b in pairwise(tried)])
-    best = _turn(changes)
-    if best <= 1:
+    """The spacing of least change, or where the changes stop falling with the noise well before, and that change.
+
+    Args:
+        changes: those between the first and third spacing tried, the second and fourth, and so on.
+    """
+    best, heights = _minimum(changes), np.log(np.maximum(changes, 1e-300))
+    at = float(best)
+    if best <= 2:
         # Noise that is smooth from pose to pose, as that of interpolated or filtered poses is, hardly changes between
         # narrow spacings: fits agree there without being right. The widest that agrees as well has less of it.
-        alike = [c <= _ALIKE * min(changes[:2]) for c in changes]
-        best = alike.index(False, best) - 1 if False in alike[best:] else best
-        if best > 1:
-            return float(np.exp(middles[best])), changes[best]
-    heights = np.log(np.maximum(changes, 1e-300))
-    if 0 < best < len(heights) - 1:
+        alike = [c <= _ALIKE * min(changes[:4]) for c in changes]
+        at = float(alike.index(False, best) - 1 if False in alike[best:] else best)
+    elif (end := _end_of_fall(heights[: best + 1])) is not None:
+        at = end
+    elif best < len(heights) - 1:
         a, b, c = heights[best - 1 : best + 2]
-        shift = 0.5 * (a - c) / max(a - 2 * b + c, 1e-12)
-        return float(np.exp(middles[best] + np.clip(shift, -0.5, 0.5) * np.log(_RATIO))), changes[best]
-    return float(np.exp(middles[best])), changes[best]
+        at = best + float(np.clip(0.5 * (a - c) / max(a - 2 * b + c, 1e-12), -0.5, 0.5))
+    return tried[1] * _RATIO**at, float(np.exp(np.interp(at, np.arange(len(heights)), heights)))
 
 
-def _turn(changes: list[float]) -> int:
-    """Where changes stop falling with the noise: the first minimum that is one, or well before it where they level out.
-
-    The least of all may be at spacings so wide that neighbouring fits agree on missing the motion.
-    """
+def _minimum(changes: list[float]) -> int:
+    """The first minimum that is one: at spacings wider still neighbouring fits may agree on missing the motion."""
     best = 0
     for i, change in enumerate(changes):
         if change < changes[best]:
             best = i
         elif change > _RISE * changes[best]:
             break
-    ratios = [b / max(a, 1e-300) for a, b in pairwise(changes)]
-    for i in range(1, best - _WELL_BEFORE + 1):
-        if min(ratios[i], ratios[i + 1]) > _LEVEL:
-            return i
     return best
+
+
+def _end_of_fall(heights: FloatArray) -> float | None:
+    """Where the fall to the minimum, at the end of `heights`, has slowed down for good, if that is well before it: from
+    there on the changes are motion that is missed."""
+    slopes = heights[2:] - heights[:-2]
+    for i in range(1, len(slopes) - _WELL_BEFORE + 1):
+        slow = _SLOWED * slopes[:i].min()
+        if slow < slopes[i - 1]:
+            continue
+        if (slopes[i : i + _WELL_BEFORE] > slow).all():
+            at = i + float((slow - slopes[i - 1]) / (slopes[i] - slopes[i - 1]))
+            return at if at <= len(heights) - 1 - _WELL_BEFORE else None
+    return None
 
 
 def _widest_within(

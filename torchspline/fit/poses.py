@@ -76,7 +76,7 @@ def fit_poses(
         poses: (N, 7) [x, y, z, qw, qx, qy, qz], body to world; rows with NaN are left out.
         dt: knot spacing, seconds. What it should be depends on the data: a wrong spacing costs more than anything.
             "auto" finds one from the data, see `knots.choose_spacing`, and says why in the notes; positions of a split
-            trajectory may then be as smooth as a spline of a multiple of it.
+            trajectory may then be as smooth as a spline of a wider one.
         order: of the spline, 2 or more; IMU synthesis wants at least 4, better 6.
         representation: "split" (R3 x SO3) or "joint" (SE3).
         position_sigma, rotation_sigma: what a residual of one weighs, m and rad; matters to "joint" only.
@@ -154,10 +154,10 @@ def fit_poses(
         state, _, trace = minimise(linearizer.model, linearizer.model.state(), linearizer, options, show)
         linearizer.model.store(state)
         if spacing is not None and representation == "split":
-            ratio = spacing.position / width
-            # An accuracy that was asked for must not be lost by rounding up.
-            every = round(ratio) if accuracy is None else int(ratio + 1e-6)
-            trajectory.control_points[:, :3] = _smoother(knots, times, measured[:, :3], every, smoothness)
+            wide = spacing.position
+            if accuracy is not None:  # which must not be lost: a whole multiple is met exactly
+                wide = width * int(wide / width + 1e-6)
+            trajectory.control_points[:, :3] = _smoother(knots, times, measured[:, :3], wide, smoothness)
     fitted = trajectory(times).detach()
     residual = torch.full((2, t.shape[0], 3), torch.nan, dtype=torch.float64)
     residual[0, rows.cpu()] = measured[:, :3] - fitted[:, :3]
@@ -204,14 +204,14 @@ def _start(knots: Knots, times: Tensor, measured: Tensor, group: Group, smoothne
     return group.normalize(solution)
 
 
-def _smoother(knots: Knots, times: Tensor, positions: Tensor, every: int, smoothness: float) -> Tensor:
-    """Control points of the spline through the positions that has but one knot in `every`: a wider spline is one of
-    these knots, too."""
-    wide = Knots(times, knots.seconds * every, knots.order)
+def _smoother(knots: Knots, times: Tensor, positions: Tensor, spacing: float, smoothness: float) -> Tensor:
+    """Control points of the spline through the positions with knots `spacing` apart, which is not below that of these
+    knots: on these it is nearly a spline, too, or exactly if every so many of them are its own."""
+    wide = Knots(times, spacing, knots.order)
     points = wide.linear_fit(times, positions.numpy(), smoothness * len(times) / wide.segments)
     within = torch.arange(knots.order + 1, dtype=torch.float64) / knots.order
     s = (torch.arange(knots.segments, dtype=torch.float64)[:, None] + within).reshape(-1)
-    return torch.from_numpy(knots.linear_fit_at(s, wide.evaluate_at(points, s / every)))
+    return torch.from_numpy(knots.linear_fit_at(s, wide.evaluate_at(points, s * (knots.dt / wide.dt))))
 
 
 def _check_accuracy(accuracy: tuple[float, float] | None, dt: float | str) -> None:

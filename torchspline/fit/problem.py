@@ -61,6 +61,11 @@ class Problem:
         """
         checks.instance("residual", residual, Residual, "a residual such as torchspline.fit.Gyroscope")
         residual.bind(self.trajectory.group)
+        if residual.derivatives >= self.trajectory.order:
+            raise ValueError(
+                f"residual: {residual.name} depends on the derivative number {residual.derivatives}, which is zero on "
+                f"a spline of order {self.trajectory.order}; expected order {residual.derivatives + 1} or more"
+            )
         indices = {slot: _index(residual, slot, x) for slot, x in index.items()}
         for slot, x in residual.arguments.items():
             if isinstance(x, Variable) and x.value.ndim == 2 and slot not in indices:
@@ -292,6 +297,11 @@ def _check_spline(name: str, spline: BSpline) -> None:
         )
     if points.device.type != "cpu":
         raise ValueError(f"{name}: expected one on the CPU, got {points.device}; move it with .to('cpu')")
+    if points.is_inference():
+        raise ValueError(
+            f"{name}: its control points were made in torch.inference_mode and cannot be moved; make the spline "
+            "outside of it, or of their clone()"
+        )
     checks.finite(name, points)
     checks.quaternions(name, points, spline.group.arithmetic.sign_blocks)
 

@@ -15,7 +15,7 @@ def keep(module: nn.Module, name: str, x: Tensor | None) -> None:
     if isinstance(x, nn.Parameter):
         module.register_parameter(name, x)
     else:
-        module.register_buffer(name, x if x is None or x.requires_grad else x.detach().clone())
+        module.register_buffer(name, x if x is None or x.requires_grad else x.clone())
 
 
 def tensor_of(name: str, x: Any, shape: tuple[int, ...], meaning: str, batched: bool = True) -> Tensor | None:

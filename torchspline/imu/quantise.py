@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from torchspline.kernels.mode import transformed
+
 
 def saturate(x: Tensor, limit: Tensor) -> Tensor:
     """`x` within [-limit, limit]. The gradient is that of the value: zero to `x` where it is clipped."""
@@ -15,8 +17,6 @@ def quantise(x: Tensor, step: Tensor) -> Tensor:
     The derivative of a staircase is zero almost everywhere and teaches nothing: the gradient passes straight through,
     as if nothing had been rounded. The step gets none.
     """
-    if torch.is_grad_enabled() and x.requires_grad:
-        with torch.no_grad():
-            error = torch.round(x / step) * step - x
-        return x + error
+    if (torch.is_grad_enabled() and x.requires_grad) or transformed():
+        return x + (torch.round(x / step) * step - x).detach()
     return torch.round(x / step).mul_(step)

@@ -36,6 +36,7 @@ from torchspline.imu.parts import (
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, excursion
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
+from torchspline.kernels.mode import plain
 from torchspline.splines.trajectory import MECHANICS, Trajectory
 
 Given = Tensor | Sequence[float] | float | None
@@ -469,7 +470,7 @@ def _plus(own: Tensor, other: Tensor) -> Tensor:
     """The sum; in place of the first, which nobody else has seen, where autograd does not mind."""
     tracked = torch.is_grad_enabled() and (own.requires_grad or other.requires_grad)
     fits = own.shape == torch.broadcast_shapes(own.shape, other.shape)
-    return own + other if tracked or not fits else own.add_(other)
+    return own.add_(other) if fits and not tracked and plain(own, other) else own + other
 
 
 def _joined(a: Tensor, b: Tensor) -> Tensor:
