@@ -88,7 +88,15 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_generate.ROOTS, *error_robot.ROOTS):
+    for root in (
+        torchspline,
+        records,
+        Mounted,
+        SlidingWindow,
+        BatchProblem,
+        *error_generate.ROOTS,
+        *error_robot.ROOTS,
+    ):
         visit(root)
     return found
 
