@@ -74,7 +74,7 @@ def read_imu_parameters(path: str | PathLike[str], inflation: float = 1.0) -> Im
     """
     path = _path(path)
     checks.positive("inflation", inflation)
-    content: dict[str, Any] = read_yaml(path)
+    content: dict[str, Any] = read_yaml(path, f"keys such as {_DENSITIES[0]}")
     if len(content) >= 1 and all(
         isinstance(x, dict) and str(k).startswith("imu") for k, x in content.items()
     ):

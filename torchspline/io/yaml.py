@@ -8,11 +8,13 @@ from typing import Any
 _LARGEST, _MOST_ENTRIES = 2**18, 100_000
 
 
-def read_yaml(path: Path) -> dict[Any, Any]:
+def read_yaml(path: Path, names: str) -> dict[Any, Any]:
     """The mapping at the top of a YAML file; nothing in it is executed.
 
     OpenCV's first line `%YAML:1.0` is understood. Aliases are, too, as long as what they stand for has a bounded size.
 
+    Args:
+        names: what is expected at its top, for messages, such as "keys such as rate".
     Raises:
         FileNotFoundError: no such file.
         ValueError: a folder, a file that is too large, no YAML, or no mapping at its top; one line names the file and,
@@ -27,7 +29,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
             raise ValueError(f"{path}: expected YAML of at most {_LARGEST} bytes, got {size}")
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: expected a file, there is no such file") from None
+        raise FileNotFoundError(f"{path}: expected a file, there is none (no such file)") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected a YAML file, got bytes that are no text: {error}") from None
     if text.startswith("%YAML:"):  # OpenCV writes a directive that YAML does not know
@@ -54,7 +56,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         # Dates that are none, whole numbers of thousands of digits: the library lets such errors through.
         raise ValueError(f"{path}: expected YAML of settings, got {short(error)}") from None
     if not isinstance(content, dict) or not content:
-        raise ValueError(f"{path}: expected a mapping of names to values, got {type(content).__name__}")
+        raise ValueError(f"{path}: expected {names}, got {type(content).__name__}")
     return content
 
 
