@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 import torchspline as ts
@@ -77,6 +78,8 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
         "read_bvh": Reader(io.read_bvh, [Sample("walk.bvh", _BVH), packed(Sample("walk.bvh", _BVH))]),
         "Robot.from_urdf": Reader(Robot.from_urdf, [Sample("arm.urdf", _URDF)]),
     }
+    if find_spec("torchspline.calibrate"):
+        found |= _calibration(folder, samples)
     return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
 
 
@@ -98,6 +101,41 @@ def _trajectories(written: Callable[..., Sample]) -> list[Sample]:
         ),
     }
     return [written(f"{name}.npz", io.save_trajectory, x) for name, x in families.items()]
+
+
+def _calibration(folder: Path, samples: Sample) -> dict[str, Reader]:
+    from torchspline.calibrate import read_corners, read_recording
+
+    count = 24
+    tag, corner = np.divmod(np.arange(count), 4)
+    right, up = np.isin(corner, (1, 2)), corner >= 2
+    xyz = np.stack([tag % 3 * 0.15 + 0.1 * right, tag // 3 * 0.15 + 0.1 * up, np.zeros(count)], axis=1)
+    columns = {
+        "t_ns": np.array([100, 200, 300], np.int64),
+        "frame": np.repeat([0, 2], count).astype(np.uint16),
+        "tag_id": np.tile(tag, 2).astype(np.uint8),
+        "corner": np.tile(corner, 2).astype(np.uint8),
+        "uv": (np.tile(100 + 300 * xyz[:, :2], (2, 1)) + 0.25).astype(np.float32),
+        "xyz_m": np.tile(xyz, (2, 1)),
+    }
+    np.savez_compressed(folder / "cam0.npz", **columns)
+    corners = Sample("cam0.npz", (folder / "cam0.npz").read_bytes())
+    camera = io.Camera("cam0", (400.0, 401.5, 320.0, 240.0), (-0.2, 0.1, 1e-4, 0.0), (640, 480))
+    pose = ts.SE3.identity(2, dtype=torch.float64)
+    chain = io.CamChain((camera, camera), pose, torch.tensor([0.01, -0.02], dtype=torch.float64))
+    io.write_camchain(folder / "camchain-imucam.yaml", chain)
+    beside = ((corners.name, corners.content), (samples.name, samples.content))
+
+    def recording(path: Path) -> Any:
+        return read_recording(path, [path.with_name(corners.name)], [path.with_name(samples.name)])
+
+    return {
+        "read_camchain": Reader(
+            io.read_camchain, [Sample("camchain-imucam.yaml", (folder / "camchain-imucam.yaml").read_bytes())]
+        ),
+        "read_corners": Reader(read_corners, [corners]),
+        "read_recording": Reader(recording, [Sample("config.yaml", _CONFIG, beside)]),
+    }
 
 
 def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, Reader]:
@@ -202,4 +240,20 @@ _URDF = b"""<?xml version="1.0"?>
     <mimic joint="elbow" multiplier="2.0" offset="0.1"/>
   </joint>
 </robot>
+"""
+
+_CONFIG = b"""calib_target:
+  {target_type: aprilgrid, tag_rows: 2, tag_cols: 3, tag_size: 0.1, tag_spacing: 0.5}
+imu0:
+  accelerometer_noise_density: 0.002
+  gyroscope_noise_density: 1.0e-4
+  accelerometer_random_walk: 0.003
+  gyroscope_random_walk: 2.0e-5
+  g: 9.81
+cam0:
+  resolution: [640, 480]
+  camera_model: pinhole
+  distortion_model: radtan
+  intrinsics: [400, 401.5, 320, 240]
+  distortion_coeffs: [-0.2, 0.1, 1e-4, 0.0]
 """
