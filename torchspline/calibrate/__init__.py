@@ -1,0 +1,1 @@
+"""Calibration of sensors against each other from one recording."""
