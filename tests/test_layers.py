@@ -21,6 +21,7 @@ LAYERS = [
     {"imu"},
     {"fit"},
     {"functional", "robot", "io", "plot"},
+    {"calibrate"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
