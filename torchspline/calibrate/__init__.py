@@ -1,14 +1,17 @@
 """Calibration of cameras and IMUs that are mounted together, from what they measured in front of a board."""
 
+from torchspline.calibrate.board import BoardPoses, board_poses
 from torchspline.calibrate.reading import read_corners, read_recording
 from torchspline.calibrate.recording import Corners, ImuNoise, Recording
 from torchspline.io.camera import Camera
 
 __all__ = [
+    "BoardPoses",
     "Camera",
     "Corners",
     "ImuNoise",
     "Recording",
+    "board_poses",
     "read_corners",
     "read_recording",
 ]
