@@ -66,7 +66,7 @@ _SIGNATURE = (
 @cache
 def _compiled() -> Callable:
     helper, loop = (inspect.getsource(f) for f in (outer_products, to_triangles))
-    header = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("assemble.py", "gram.py")
+    header = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", "0").replace("assemble.py", "gram.py")
     header = header.rstrip() + f"\nLEAST_PIVOT = {_LEAST_PIVOT}\n\n"
     return compiled("to_triangles", f"{header}\n{_HELPER}{helper}\n\n{_ENTRY}{loop}", _SIGNATURE)
 
