@@ -239,7 +239,8 @@ class Problem:
         splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, {id(x): kept for x, kept in self._frozen.items()})
-        terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
+        pairs = zip(self.residuals, self._indices, strict=True)
+        terms = [(r.term or Term)(r, model, origin, i) for r, i in pairs]
         return Linearizer(model, [*terms, *(prior.bind(model) for prior in self.priors)])
 
 

@@ -129,6 +129,8 @@ class Residual(ABC):
     #: Ranges of the components of what is measured that are quaternions.
     measured_signs: ClassVar[tuple[tuple[int, int], ...]] = ()
     slots: ClassVar[Mapping[str, Slot]] = {}
+    #: The `Term` that binds it to a problem, where that is not the common one.
+    term: ClassVar[Any] = None
 
     def __init__(
         self,

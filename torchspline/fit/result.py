@@ -90,12 +90,10 @@ class Result:
         """
         found: dict[str, Tensor] = {}
         for term in self._terms():
-            chunks = [r for _, _, r in term.linearize(self._state)]
-            rows = torch.from_numpy(np.concatenate([np.empty((0, term.kernel.rows)), *chunks]))
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
-            found[name] = torch.empty_like(rows).index_copy(0, torch.from_numpy(term.order), rows)
+            found[name] = torch.from_numpy(term.residuals(self._state))
         return found
 
     @cached_property
@@ -109,7 +107,7 @@ class Result:
     @property
     def variance_factor(self) -> float:
         """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
-        rows = sum(len(term) * term.kernel.rows for term in self._terms())
+        rows = sum(term.numbers for term in self._terms())
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
     # ------------------------------------------------------------------ how sure

@@ -16,6 +16,10 @@ from torchspline.kernels.assemble import add_to_band, add_to_blocks
 Array = NDArray[Any]
 
 
+#: Rows of a piece in `_inner`.
+_PIECE = 256
+
+
 class Rows(NamedTuple):
     """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
 
@@ -150,7 +154,7 @@ class BandFactor(Factor):
                 raise SingularError
         self.border = system.border
         self.inverse_border = self._band_solve(system.border)
-        complement = system.corner + np.diag(damping[n:]) - np.tril(self.border.T @ self.inverse_border)
+        complement = system.corner + np.diag(damping[n:]) - np.tril(_inner(self.border, self.inverse_border))
         self.corner = complement
         if m:
             self.corner, info = lapack.dpotrf(complement, lower=1)
@@ -167,7 +171,7 @@ class BandFactor(Factor):
         inner = self._band_solve(right[:n])
         if len(right) == n:
             return inner
-        outer = right[n:] - self.border.T @ inner
+        outer = right[n:] - _inner(self.border, inner)
         outer = self._lapack.dpotrs(self.corner, outer, lower=1)[0]
         return np.concatenate([inner - self.inverse_border @ outer, outer])
 
@@ -217,6 +221,21 @@ class BandFactor(Factor):
                 below[b] = -diagonal[b + 1] @ carried
                 diagonal[b] += carried.T @ diagonal[b + 1] @ carried
         return diagonal, below
+
+
+def _inner(a: Array, b: Array) -> Array:
+    """`a^T b` of tall matrices `(n, m)` and `(n, ...)`, in pieces that a BLAS does not give to several threads.
+
+    The product takes a millisecond; waiting for a thread that another process keeps off its core takes hundreds.
+    """
+    right = b.reshape(len(b), -1)
+    pieces, rest = divmod(len(a), _PIECE)
+    whole = pieces * _PIECE
+    first, second = (x[:whole].reshape(pieces, _PIECE, x.shape[1]) for x in (a, right))
+    total = (first.transpose(0, 2, 1) @ second).sum(axis=0)
+    if rest:
+        total = total + a[whole:].T @ right[whole:]
+    return total.reshape(a.shape[1], *b.shape[1:])
 
 
 class SparseSystem(System):

@@ -1,0 +1,306 @@
+"""The least-squares problem of a calibration: its unknowns, where they start, and the measurements of each sensor."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from torch import Tensor
+
+from torchspline.calibrate.images import PROJECTIONS, ImageBlock
+from torchspline.calibrate.recording import Recording
+from torchspline.fit.losses import Loss
+from torchspline.fit.problem import Problem
+from torchspline.fit.residual import Argument, Clock, Residual
+from torchspline.fit.residuals import Accelerometer, Gyroscope
+from torchspline.fit.variables import Variable
+from torchspline.groups import R3, SE3, SO3, Group
+from torchspline.io.records import ImuRecord
+from torchspline.splines.bspline import BSpline
+
+NS = 1_000_000_000
+#: Trajectories by representation.
+GROUPS = {"split": "R3xSO3", "joint": "SE3"}
+#: How long before the first and after the last image the trajectory goes on, where the IMU does, s.
+_PAD = 0.1
+#: Off-diagonal numbers of an accelerometer's scaling that would turn the frame of the IMU, and what they may be.
+_ABOVE_DIAGONAL, _FIXED, _FREE = (1, 2, 5), 1e-9, 1.0
+_UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class Guess(NamedTuple):
+    """Where a solution starts; see `start.Start`, of which this is what the problem needs."""
+
+    #: SE3 of each camera, camera to IMU, and s.
+    T_imu_cam: Sequence[Tensor]
+    time_offset: Sequence[float]
+    #: (3,) acceleration in the frame of the board.
+    gravity: Tensor
+    gyro_bias: Tensor
+    accel_bias: Tensor
+    #: IMU in the frame of the board: (P,) int64 on the IMU's clock, ascending, and (P, 7).
+    t_ns: Tensor
+    poses: Tensor
+
+
+class Options(NamedTuple):
+    """What `calibrate` was asked for; see there."""
+
+    order: int
+    spacing: float
+    representation: str
+    estimate: frozenset[str]
+    bias_spacing: float | None
+    pixel_sigma: float
+    loss: Loss | None
+
+
+@dataclass
+class CameraUnknowns:
+    extrinsics: Variable
+    #: Minus the time offset, s: what the camera's clock is ahead of the IMU's.
+    ahead: Variable
+    intrinsics: Variable
+    line_delay: Variable | None
+    residual: Residual
+    #: Which images and corners take part.
+    images: Tensor
+    corners: Tensor
+
+
+@dataclass
+class ImuUnknowns:
+    gyro_bias: Variable | BSpline
+    accel_bias: Variable | BSpline
+    gyroscope: Residual
+    accelerometer: Residual
+    #: Which samples take part.
+    samples: Tensor
+    rotation: Variable | None = None
+    lever_arm: Variable | None = None
+    ahead: Variable | None = None
+    gyro_scaling: Variable | None = None
+    accel_scaling: Variable | None = None
+
+
+@dataclass
+class Layout:
+    """The problem and what its unknowns mean."""
+
+    problem: Problem
+    trajectory: BSpline
+    gravity: Variable
+    cameras: list[CameraUnknowns] = field(default_factory=list)
+    imus: list[ImuUnknowns] = field(default_factory=list)
+
+
+def build(recording: Recording, guess: Guess, options: Options, scales: dict[str, float]) -> Layout:
+    """All sensors on one trajectory of the first IMU, on its clock.
+
+    Args:
+        scales: by the name of a residual, what its standard deviations are multiplied by.
+    Raises:
+        ValueError: sensors that share no stretch of time, gaps in the readings of the IMU.
+    """
+    trajectory = _trajectory(recording, guess, options)
+    gravity = Variable(
+        "gravity", guess.gravity * (recording.gravity / guess.gravity.norm()), sphere=True
+    )
+    layout = Layout(Problem(trajectory), trajectory, gravity)
+    for i in range(len(recording.imus)):
+        _add_imu(layout, recording, i, guess, options, scales)
+    for i in range(len(recording.cameras)):
+        _add_camera(layout, recording, i, guess, options, scales)
+    return layout
+
+
+# ---------------------------------------------------------------------- the trajectory
+
+
+def span(recording: Recording, guess: Guess) -> tuple[int, int]:
+    """First and last nanosecond, on the clock of the first IMU, at which it and a camera measured."""
+    imu, pad = recording.imus[0], round(_PAD * NS)
+    stamps = [
+        (int(c.t_ns[0]) + round(offset * NS), int(c.t_ns[-1]) + round(offset * NS))
+        for c, offset in zip(recording.corners, guess.time_offset, strict=True)
+        if len(c.t_ns)
+    ]
+    if not stamps or not len(imu):
+        raise ValueError("recording: expected images and readings of an IMU, got none of one kind")
+    first = max(min(a for a, _ in stamps) - pad, int(imu.time_ns[0]))
+    last = min(max(b for _, b in stamps) + pad, int(imu.time_ns[-1]))
+    if last <= first:
+        raise ValueError(
+            "recording: expected images while the IMU measured; got images from "
+            f"{min(a for a, _ in stamps)} to {max(b for _, b in stamps)} ns on its clock and readings from "
+            f"{int(imu.time_ns[0])} to {int(imu.time_ns[-1])} ns; are the clocks synchronised, or the offsets right?"
+        )
+    return first, last
+
+
+def _trajectory(recording: Recording, guess: Guess, options: Options) -> BSpline:
+    first, last = span(recording, guess)
+    dt = max(round(options.spacing * NS), 1)
+    segments = (last - first) // dt
+    if segments < 1:
+        raise ValueError(
+            f"spacing: expected less than the {(last - first) / NS:g} s that sensors share, got {options.spacing:g}"
+        )
+    _check_gaps(recording.imus[0], first, first + segments * dt, options)
+    count = segments + options.order - 1
+    t = (np.arange(count) - 0.5 * (options.order - 2)) * (dt / NS)
+    known = (guess.t_ns - first).numpy() / NS
+    points = _through(known, guess.poses.numpy(), np.clip(t, known[0], known[-1]))
+    return BSpline(
+        torch.from_numpy(points), group=Group(GROUPS[options.representation]), order=options.order, dt_ns=dt, t0_ns=first,
+        learnable=False,
+    )  # fmt: skip
+
+
+def _through(t: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Poses between others: good enough to start from."""
+    if len(t) == 1:
+        return np.repeat(poses, len(at), axis=0)
+    position = CubicSpline(t, poses[:, :3])(at)
+    rotation = RotationSpline(t, Rotation.from_quat(poses[:, 3:], scalar_first=True))(at)
+    return np.concatenate([position, rotation.as_quat(scalar_first=True)], axis=1)
+
+
+def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None:
+    """Control points that no reading touches would be left open."""
+    stamps = imu.window(first, last).time_ns
+    steps = stamps.diff()
+    widest = (options.order - 1) * round(options.spacing * NS)
+    if len(steps) and int(steps.max()) > widest:
+        row = int(steps.argmax())
+        raise ValueError(
+            f"{imu.source or 'imus[0]'}: expected readings at most {widest / NS:g} s apart for a spline of order "
+            f"{options.order} with knots every {options.spacing:g} s; got a gap of {int(steps[row]) / NS:.3f} s at "
+            f"{int(stamps[row])} ns; use a larger spacing, or a part of the recording without the gap"
+        )
+    rate = (len(stamps) - 1) / max((last - first) / NS, 1e-9)
+    if rate * options.spacing < 0.999:
+        raise ValueError(
+            f"spacing: expected at least the {1 / max(rate, 1e-9):.4g} s between readings of the IMU, got "
+            f"{options.spacing:g}: every control point needs a reading"
+        )
+
+
+# ---------------------------------------------------------------------- sensors
+
+
+def _add_imu(
+    layout: Layout, recording: Recording, i: int, guess: Guess, options: Options, scales: dict[str, float]
+) -> None:
+    record, noise = recording.imus[i], recording.noise[i]
+    first, last = layout.trajectory.domain
+    inside = (record.time_ns >= first) & (record.time_ns <= last)
+    part = record.window(int(first), int(last))
+    if len(part) < 2:
+        raise ValueError(f"{record.source or f'imus[{i}]'}: expected readings while cameras saw the board, got none")
+    rate = math.sqrt((len(part) - 1) * NS / int(part.time_ns[-1] - part.time_ns[0]))
+    own: dict[str, Variable] = {}
+    clock = None
+    if i > 0:
+        own["rotation"] = Variable(f"imu{i} rotation", _turned(recording.imus[0], part), group=SO3)
+        own["lever_arm"] = Variable(f"imu{i} lever arm", torch.zeros(3, dtype=torch.float64))
+        ahead = Variable(f"imu{i} ahead", torch.zeros(1, dtype=torch.float64))
+        clock = Clock(offset=ahead)
+    gyro_start, accel_start = (guess.gyro_bias, guess.accel_bias) if i == 0 else (torch.zeros(3), torch.zeros(3))
+    gyro_bias = _bias(f"imu{i} gyro bias", gyro_start, layout.trajectory, options)
+    accel_bias = _bias(f"imu{i} accel bias", accel_start, layout.trajectory, options)
+    gyro_extra: dict[str, Argument] = {k: v for k, v in own.items() if k == "rotation"}
+    accel_extra: dict[str, Argument] = {**own}
+    if "imu_scaling" in options.estimate:
+        for name, extra in (("gyro", gyro_extra), ("accel", accel_extra)):
+            extra["scaling"] = Variable(f"imu{i} {name} scaling", torch.tensor(_UNIT, dtype=torch.float64))
+    names = f"imu{i} gyroscope", f"imu{i} accelerometer"
+    gyroscope = Gyroscope(
+        part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate * scales.get(names[0], 1.0),
+        loss=options.loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
+    )  # fmt: skip
+    accelerometer = Accelerometer(
+        part.time_ns, part.accelerometer, sigma=noise.accel_density * rate * scales.get(names[1], 1.0),
+        loss=options.loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
+    )  # fmt: skip
+    problem = layout.problem
+    problem.add(gyroscope)
+    problem.add(accelerometer)
+    found = ImuUnknowns(gyro_bias, accel_bias, gyroscope, accelerometer, inside)
+    if i > 0:
+        found.rotation, found.lever_arm, found.ahead = own["rotation"], own["lever_arm"], ahead
+    if "imu_scaling" in options.estimate:
+        found.gyro_scaling, found.accel_scaling = gyro_extra["scaling"], accel_extra["scaling"]
+        # The frame of the IMU is that of its accelerometer: x along its first axis, y in the plane of the first two.
+        sigma = torch.full((9,), _FREE, dtype=torch.float64)
+        sigma[list(_ABOVE_DIAGONAL)] = _FIXED
+        if i == 0:
+            problem.add_prior(found.accel_scaling, sigma=sigma)
+    layout.imus.append(found)
+
+
+def _bias(name: str, start: Tensor, trajectory: BSpline, options: Options) -> Variable | BSpline:
+    """One for all times, or a spline over the trajectory's time."""
+    if options.bias_spacing is None:
+        return Variable(name, start.double())
+    first, last = trajectory.domain
+    dt, order = round(options.bias_spacing * NS), 4
+    count = -(-int(last - first) // dt) + order - 1
+    points = start.double().repeat(count, 1)
+    return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=int(first), learnable=False)
+
+
+def _turned(reference: ImuRecord, other: ImuRecord) -> Tensor:
+    """Rotation of another IMU in the first one, by what both gyroscopes read at the same stamps [Wahba 1965]."""
+    at = other.seconds(int(reference.time_ns[0])).numpy()
+    seen = np.stack([np.interp(at, reference.time.numpy(), x) for x in reference.gyroscope.numpy().T], axis=1)
+    seen, own = (x - x.mean(axis=0) for x in (seen, other.gyroscope.numpy()))
+    return torch.from_numpy(Rotation.align_vectors(seen, own)[0].as_quat(scalar_first=True))
+
+
+def _add_camera(
+    layout: Layout, recording: Recording, i: int, guess: Guess, options: Options, scales: dict[str, float]
+) -> None:
+    camera, corners, problem = recording.cameras[i], recording.corners[i], layout.problem
+    number, name = f"cam{i}", f"cam{i} corners"
+    offset = float(guess.time_offset[i])
+    first, last = layout.trajectory.domain
+    near = corners.t_ns + round(offset * NS)
+    images = (near >= first) & (near <= last)
+    kept = images[corners.frame]
+    if not bool(kept.any()):
+        raise ValueError(
+            f"{corners.source or camera.name}: expected corners while the IMU measured, got none there"
+        )
+    ahead = Variable(f"{number} ahead", torch.tensor([-offset], dtype=torch.float64))
+    extrinsics = Variable(
+        f"{number} extrinsics", SE3.normalize(guess.T_imu_cam[i].double()), group=SE3
+    )
+    intrinsics = Variable(f"{number} intrinsics", camera.parameters)
+    frame = (torch.cumsum(images, 0) - 1)[corners.frame[kept]]
+    uv, xyz, stamps = corners.uv[kept], corners.xyz[kept], corners.t_ns[images]
+    sigma = options.pixel_sigma * scales.get(name, 1.0)
+    delay = None
+    shared = {"intrinsics": intrinsics, "T_body_camera": extrinsics}
+    if "line_delay" in options.estimate:
+        delay = Variable(f"{number} line delay", torch.zeros(1, dtype=torch.float64))
+        middle = 0.5 * (camera.resolution[1] - 1)
+        residual = PROJECTIONS[camera.distortion](
+            stamps[frame], uv, landmark=xyz, sigma=sigma, loss=options.loss, name=name, **shared,
+            clock=Clock(offset=ahead, delay=delay, late=uv[:, 1] - middle),
+        )  # fmt: skip
+    else:
+        residual = ImageBlock(
+            stamps, image=frame, uv=uv, xyz=xyz, distortion=camera.distortion, sigma=sigma, loss=options.loss,
+            name=name, clock=Clock(offset=ahead), **shared,
+        )  # fmt: skip
+    problem.add(residual)
+    if "intrinsics" not in options.estimate:
+        problem.freeze(intrinsics)
+    if "time_offset" not in options.estimate:
+        problem.freeze(ahead)
+    layout.cameras.append(CameraUnknowns(extrinsics, ahead, intrinsics, delay, residual, images, kept))
