@@ -1,7 +1,9 @@
 """Reading a recording: corners from npz archives, IMU samples from csv files, the rest from one YAML file."""
 
+import io
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -14,9 +16,10 @@ from numpy.typing import NDArray
 from torchspline.calibrate.recording import Corners, ImuNoise, Recording
 from torchspline.io import read_imu
 from torchspline.io.camera import camera_from
+from torchspline.io.sections import number, numbered, read_sections, section_of
 
-#: Larger files are no recordings of a calibration, whatever their headers promise (bytes).
-_LARGEST_ARRAY, _LARGEST_CONFIG = 2**31, 2**20
+#: Larger arrays are no recordings of a calibration, whatever their headers promise (bytes).
+_LARGEST = 2**30
 #: Columns of an archive: name there, name here, whole numbers, dimensions.
 _COLUMNS = (
     ("t_ns", "t_ns", True, 1),
@@ -55,10 +58,10 @@ def read_recording(config: Path_, corners: Sequence[Path_], imus: Sequence[Path_
         ValueError: files that cannot be read, are damaged or do not go together; the message names file and field.
     """
     corners, imus = _paths("corners", corners), _paths("imus", imus)
-    if not isinstance(config, (str, PathLike)):
+    if not isinstance(config, (str, PathLike)):  # named as it is called here
         raise TypeError(f"config: expected a path, got {type(config).__name__}")
     path = Path(config)
-    content = _yaml(path)
+    content = read_sections(path)
     cameras = [
         _section(path, content, "cam", i, camera_from) for i in range(_count(path, content, "cam", corners))
     ]
@@ -72,7 +75,7 @@ def read_recording(config: Path_, corners: Sequence[Path_], imus: Sequence[Path_
     if "calib_target" in content:
         for found in seen:
             _check_board(path, content["calib_target"], found)
-    gravity = {"gravity": _number(path, "g", gravities.pop())} if gravities else {}
+    gravity = {"gravity": number(f"{path}: g", gravities.pop())} if gravities else {}
     return Recording(tuple(cameras), tuple(seen), tuple(read_imu(x) for x in imus), tuple(noises), **gravity)
 
 
@@ -112,7 +115,7 @@ def _archive(path: Path) -> dict[str, NDArray[Any]]:
             return columns
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as reason:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as reason:
         raise ValueError(
             f"{path}: expected an npz archive of corners, got a damaged or truncated file ({reason})"
         ) from None
@@ -120,25 +123,23 @@ def _archive(path: Path) -> dict[str, NDArray[Any]]:
 
 def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
     """One array; its header is believed only where it agrees with the size of what is stored."""
-    if info.file_size > _LARGEST_ARRAY:
-        raise ValueError(f"{path}: {name}: expected at most {_LARGEST_ARRAY} bytes, got {info.file_size}")
-    with archive.open(info) as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            shape, _, dtype = read[version](file)
-        except (ValueError, KeyError) as reason:
-            raise ValueError(
-                f"{path}: {name}: expected an array of NumPy, got damaged data ({reason})"
-            ) from None
-        promised = file.tell() + math.prod(shape) * dtype.itemsize
+    if info.file_size > _LARGEST:
+        raise ValueError(f"{path}: {name}: expected at most {_LARGEST} bytes, got {info.file_size}")
+    file = io.BytesIO(archive.read(info))  # the whole of it: only then is its checksum looked at
+    try:
+        version = np.lib.format.read_magic(file)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, _, dtype = read[version](file)
+    except (ValueError, KeyError) as reason:
+        raise ValueError(f"{path}: {name}: expected an array of NumPy, got damaged data ({reason})") from None
+    promised = file.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject or promised != info.file_size:
         raise ValueError(
             f"{path}: {name}: expected an array of plain numbers, got {dtype} of shape {shape} "
             f"in {info.file_size} bytes"
         )
-    with archive.open(info) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _converted(path: Path, name: str, x: NDArray[Any], whole: bool, dimensions: int) -> NDArray[Any]:
@@ -154,29 +155,11 @@ def _converted(path: Path, name: str, x: NDArray[Any], whole: bool, dimensions: 
 # ---------------------------------------------------------------------- the YAML file
 
 
-def _yaml(path: Path) -> dict[str, Any]:
-    import yaml
-
-    if path.is_dir():
-        raise ValueError(f"{path}: expected a file, got a folder")
-    try:
-        if path.stat().st_size > _LARGEST_CONFIG:
-            raise ValueError(f"{path}: expected at most {_LARGEST_CONFIG} bytes, got {path.stat().st_size}")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as reason:
-        raise ValueError(f"{path}: expected a YAML file, got {' '.join(str(reason).split())}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected sections such as cam0 and imu0, got {type(content).__name__}")
-    return content
-
-
 def _count(path: Path, content: Mapping[str, Any], kind: str, files: Sequence[Path]) -> int:
     """As many as there are files; the sections have to be there, and no others."""
-    sections = [x for x in content if isinstance(x, str) and x.startswith(kind) and x[len(kind) :].isdigit()]
+    sections = numbered(content, kind)
     wanted = [f"{kind}{i}" for i in range(len(files))]
-    if sorted(sections) != sorted(wanted):
+    if sections != wanted:
         raise ValueError(
             f"{path}: expected one section for each of the {len(files)} files of {kind}s, "
             f"{', '.join(wanted) or 'none'}, got {', '.join(sections) or 'none'}"
@@ -185,13 +168,12 @@ def _count(path: Path, content: Mapping[str, Any], kind: str, files: Sequence[Pa
 
 
 def _section(path: Path, content: Mapping[str, Any], kind: str, i: int, parse: Any) -> Any:
-    section = content[f"{kind}{i}"]
-    if not isinstance(section, dict):
-        raise ValueError(f"{path}: {kind}{i}: expected a section of entries, got {type(section).__name__}")
+    name = f"{kind}{i}"
+    section = section_of(path, content, name)
     try:
-        return parse(section, f"{kind}{i}")
+        return parse(section, name)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {kind}{i}: {error}") from None
+        raise ValueError(f"{path}: {name}: {error}") from None
 
 
 def _noise(section: Mapping[str, Any], name: str) -> ImuNoise:
@@ -202,18 +184,8 @@ def _noise(section: Mapping[str, Any], name: str) -> ImuNoise:
             raise ValueError(
                 f"{theirs[0]}: expected it in the section, got only {', '.join(map(str, section))}"
             )
-        found[ours] = _number(None, key, section[key])
+        found[ours] = number(key, section[key])
     return ImuNoise(**found)
-
-
-def _number(path: Path | None, name: str, x: Any) -> float:
-    """YAML 1.1 takes 2e-3 for a word."""
-    try:
-        if isinstance(x, (bool, list, dict)):
-            raise ValueError
-        return float(x)
-    except (TypeError, ValueError):
-        raise ValueError(f"{f'{path}: ' if path else ''}{name}: expected a number, got {x!r}") from None
 
 
 def _check_board(path: Path, target: Any, corners: Corners) -> None:
@@ -224,7 +196,7 @@ def _check_board(path: Path, target: Any, corners: Corners) -> None:
     missing = [x for x in names if x not in target]
     if missing:
         raise ValueError(f"{path}: calib_target: {missing[0]}: expected a number, got none")
-    rows, columns, size, spacing = (_number(path, f"calib_target: {x}", target[x]) for x in names)
+    rows, columns, size, spacing = (number(f"{path}: calib_target: {x}", target[x]) for x in names)
     if len(corners) == 0:
         return
     stray = (corners.tag_id < 0) | (corners.tag_id >= rows * columns)

@@ -1,4 +1,5 @@
-"""Reading and writing recordings: `read_poses`, `read_imu`, `write_poses`, `write_imu`.
+"""Reading and writing recordings: `read_poses`, `read_imu`, `write_poses`, `write_imu`; and what calibration finds:
+`read_camchain`, `write_camchain`.
 
 To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
 """
@@ -9,11 +10,24 @@ from pathlib import Path
 import torch
 
 from torchspline.io import euroc, kitti, tum
+from torchspline.io.camchain import CamChain, read_camchain, write_camchain
+from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
 from torchspline.io.text import Table, read_table
 
-__all__ = ["ImuRecord", "PoseRecord", "read_imu", "read_poses", "write_imu", "write_poses"]
+__all__ = [
+    "CamChain",
+    "Camera",
+    "ImuRecord",
+    "PoseRecord",
+    "read_camchain",
+    "read_imu",
+    "read_poses",
+    "write_camchain",
+    "write_imu",
+    "write_poses",
+]
 
 _FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in (euroc, kitti, tum)}
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.io.sections import number
 
 #: What files call the distortion models, and what they are called here.
 DISTORTIONS = {
@@ -86,11 +87,15 @@ def camera_from(section: Mapping[str, Any], name: str) -> Camera:
         raise ValueError(f"camera_model: expected 'pinhole', got {model!r}")
     if distortion not in DISTORTIONS:
         raise ValueError(f"distortion_model: expected one of {', '.join(DISTORTIONS)}, got {distortion!r}")
+
+    def numbers(name: str, x: Any, count: int) -> Any:
+        return _numbers(name, [number(name, y) for y in x] if isinstance(x, list) else x, count)
+
     return Camera(
         name=name,
-        intrinsics=_numbers("intrinsics", entry("intrinsics", "proj_params"), 4),
-        coefficients=_numbers("distortion_coeffs", entry("distortion_coeffs", "dist_params"), 4),
-        resolution=_numbers("resolution", entry("resolution"), 2),
+        intrinsics=numbers("intrinsics", entry("intrinsics", "proj_params"), 4),
+        coefficients=numbers("distortion_coeffs", entry("distortion_coeffs", "dist_params"), 4),
+        resolution=numbers("resolution", entry("resolution"), 2),
         distortion=DISTORTIONS[distortion],
     )
 
