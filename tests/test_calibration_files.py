@@ -184,10 +184,14 @@ def test_files_that_are_cut_off(folder):
 
 
 def test_archives_that_are_damaged_inside(folder):
-    whole = bytearray((folder / "cam0.npz").read_bytes())
-    whole[len(whole) // 3] ^= 0x55
-    (folder / "cam0.npz").write_bytes(whole)
-    with pytest.raises(ValueError, match=r"cam0\.npz"):
+    np.savez(folder / "cam0.npz", **columns())
+    whole = (folder / "cam0.npz").read_bytes()
+    pixels = columns()["uv"].tobytes()
+    assert pixels in whole
+    (folder / "cam0.npz").write_bytes(whole.replace(pixels, pixels[:-1] + b"\x01"))
+    with pytest.raises(
+        ValueError, match=r"cam0\.npz: expected an npz archive of corners, got a damaged .*uv"
+    ):
         read(folder)
 
 
