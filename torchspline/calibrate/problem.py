@@ -57,6 +57,7 @@ class Options(NamedTuple):
     bias_spacing: float | None
     pixel_sigma: float
     loss: Loss | None
+    imu_loss: Loss | None
 
 
 @dataclass
@@ -221,11 +222,11 @@ def _add_imu(
     names = f"imu{i} gyroscope", f"imu{i} accelerometer"
     gyroscope = Gyroscope(
         part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate * scales.get(names[0], 1.0),
-        loss=options.loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
+        loss=options.imu_loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
     )  # fmt: skip
     accelerometer = Accelerometer(
         part.time_ns, part.accelerometer, sigma=noise.accel_density * rate * scales.get(names[1], 1.0),
-        loss=options.loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
+        loss=options.imu_loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
     )  # fmt: skip
     problem = layout.problem
     problem.add(gyroscope)
