@@ -3,6 +3,7 @@
 from torchspline.calibrate.board import BoardPoses, board_poses
 from torchspline.calibrate.reading import read_corners, read_recording
 from torchspline.calibrate.recording import Corners, ImuNoise, Recording
+from torchspline.calibrate.start import Start, find_start
 from torchspline.io.camera import Camera
 
 __all__ = [
@@ -11,7 +12,9 @@ __all__ = [
     "Corners",
     "ImuNoise",
     "Recording",
+    "Start",
     "board_poses",
+    "find_start",
     "read_corners",
     "read_recording",
 ]

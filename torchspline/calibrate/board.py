@@ -1,15 +1,16 @@
 """Where the board was in each image by itself: a homography, the pose in it, and least squares on pixels.
 
 Images are worked on in blocks of similar numbers of corners, padded to the same number: whole arrays, small enough to
-stay in the processor's cache. Threads do not help: the interpreter starts small operations one at a time.
+stay in the processor's cache. NumPy's, since PyTorch would spread each of these small operations over threads.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
@@ -18,6 +19,7 @@ from torchspline.fit.residuals import ReprojectionEquidistant, ReprojectionRadta
 from torchspline.groups.group import SO3
 from torchspline.io.camera import Camera
 
+Array = NDArray[Any]
 #: Images a block.
 _BLOCK = 64
 #: Fewest corners of an image whose pose is looked for; four determine it without a check.
@@ -85,28 +87,23 @@ def board_poses(camera: Camera, corners: Corners) -> BoardPoses:
     """
     checks.instance("camera", camera, Camera, "a torchspline.calibrate.Camera")
     checks.instance("corners", corners, Corners, "torchspline.calibrate.Corners")
-    first = corners.first
-    counts = first.diff()
-    reason = torch.zeros(len(counts), dtype=torch.int64)
+    first = corners.first.numpy()
+    counts = np.diff(first)
+    reason = np.zeros(len(counts), np.int64)
     reason[_narrow(corners, counts)] = 2
     reason[counts < FEWEST] = 1
-    pose = torch.full((len(counts), 7), math.nan, dtype=torch.float64)
-    rms = torch.full((len(counts),), math.nan, dtype=torch.float64)
-    error = torch.full((len(corners), 2), math.nan, dtype=torch.float64)
-
-    tried = torch.nonzero(reason == 0).flatten()
-    tried = tried[torch.argsort(counts[tried], stable=True)]
-
-    def solve(images: Tensor) -> None:
+    pose = np.full((len(counts), 7), math.nan)
+    rms = np.full(len(counts), math.nan)
+    error = np.full((len(corners), 2), math.nan)
+    tried = np.flatnonzero(reason == 0)
+    tried = tried[np.argsort(counts[tried], kind="stable")]
+    for begin in range(0, len(tried), _BLOCK):
+        images = tried[begin : begin + _BLOCK]
         block = _gather(corners, first[images], counts[images])
-        rotation, translation, residual = _refine(camera, block, *_start(camera, block))
-        pose[images] = torch.cat([translation, SO3.from_matrix(rotation)], dim=1)
-        rms[images] = (residual.square().sum(dim=(0, 2)) / counts[images]).sqrt()
+        R, t, residual = _refine(camera, block, *_start(camera, block))
+        pose[images] = np.concatenate([t, SO3.from_matrix(torch.from_numpy(R)).numpy()], axis=1)
+        rms[images] = np.sqrt((residual**2).sum(axis=(0, 2)) / counts[images])
         error[block.rows[block.there]] = residual[:, block.there].T
-
-    with torch.no_grad():
-        for images in tried.split(_BLOCK):
-            solve(images)
     reason[rms > MISFIT] = 3
     pose[reason != 0] = math.nan
     notes = [
@@ -114,82 +111,83 @@ def board_poses(camera: Camera, corners: Corners) -> BoardPoses:
         for why in range(1, len(REASONS))
         if (count := int((reason == why).sum()))
     ]
-    return BoardPoses(corners.t_ns, pose, rms, error, reason, notes)
+    pose_, rms_, error_, reason_ = map(torch.from_numpy, (pose, rms, error, reason))
+    return BoardPoses(corners.t_ns, pose_, rms_, error_, reason_, notes)
 
 
-def _narrow(corners: Corners, counts: Tensor) -> Tensor:
+def _narrow(corners: Corners, counts: Array) -> Array:
     """(F,) whether the corners of an image lie on a line of the board, or nearly so."""
-    frame, x, y = corners.frame, corners.xyz[:, 0], corners.xyz[:, 1]
-    n = counts.clamp_min(1).to(torch.float64)
+    frame, (x, y, _) = corners.frame.numpy(), corners.xyz.numpy().T
+    n = counts.clip(1)
 
-    def mean(z: Tensor) -> Tensor:
-        return torch.zeros(len(counts), dtype=torch.float64).index_add_(0, frame, z) / n
+    def mean(z: Array) -> Array:
+        return np.bincount(frame, z, len(counts)) / n
 
     x, y = x - mean(x)[frame], y - mean(y)[frame]
     xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
     # Variances along and across the longest direction.
-    middle, half = 0.5 * (xx + yy), torch.hypot(0.5 * (xx - yy), xy)
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     return middle - half <= _NARROW**2 * (middle + half)
 
 
 class _Block(NamedTuple):
     """Corners of B images, padded to C: rows of `Corners` and whether they are there; pixels and board coordinates."""
 
-    rows: Tensor
-    there: Tensor
-    u: Tensor
-    v: Tensor
-    x: Tensor
-    y: Tensor
+    rows: Array
+    there: Array
+    u: Array
+    v: Array
+    x: Array
+    y: Array
 
 
-def _gather(corners: Corners, first: Tensor, counts: Tensor) -> _Block:
-    steps = torch.arange(int(counts.max()))
+def _gather(corners: Corners, first: Array, counts: Array) -> _Block:
+    steps = np.arange(counts.max())
     there = steps < counts[:, None]
-    rows = torch.where(there, first[:, None] + steps, first[:, None])
-    return _Block(rows, there, *corners.uv[rows].unbind(-1), *corners.xyz[rows][..., :2].unbind(-1))
+    rows = np.where(there, first[:, None] + steps, first[:, None])
+    u, v = corners.uv.numpy().T
+    x, y, _ = corners.xyz.numpy().T
+    return _Block(rows, there, u[rows], v[rows], x[rows], y[rows])
 
 
 # ---------------------------------------------------------------------- a start from nothing
 
 
-def _start(camera: Camera, block: _Block) -> tuple[Tensor, Tensor]:
+def _start(camera: Camera, block: _Block) -> tuple[Array, Array]:
     """Rotation matrices (B, 3, 3) and translations (B, 3), board to camera, from homographies."""
     a, b, valid = _undistort(camera, block.u, block.v)
-    weight = (block.there & valid).to(torch.float64)
+    weight = (block.there & valid).astype(np.float64)
     H = _homography(block.x, block.y, a, b, weight)
     # Depth is positive where the corners are.
-    n = weight.sum(dim=1).clamp_min(1.0)
-    mean = torch.stack(
-        [(weight * block.x).sum(1) / n, (weight * block.y).sum(1) / n, torch.ones_like(n)], dim=1
-    )
-    depth = (H[:, 2] * mean).sum(dim=1)
-    size = (H[:, :, 0].norm(dim=1) * H[:, :, 1].norm(dim=1)).sqrt().clamp_min(1e-12)
-    H = H * (torch.where(depth < 0, -1.0, 1.0) / size)[:, None, None]
-    matrix = torch.stack([H[..., 0], H[..., 1], torch.linalg.cross(H[..., 0], H[..., 1])], dim=-1)
-    U, _, Vh = torch.linalg.svd(matrix)
-    turn = torch.linalg.det(U @ Vh)
-    U = torch.cat([U[..., :2], U[..., 2:] * turn[:, None, None]], dim=-1)
+    n = weight.sum(axis=1).clip(1.0)
+    mean = np.stack([(weight * block.x).sum(1) / n, (weight * block.y).sum(1) / n, np.ones_like(n)], axis=1)
+    depth = (H[:, 2] * mean).sum(axis=1)
+    size = np.sqrt(np.linalg.norm(H[:, :, 0], axis=1) * np.linalg.norm(H[:, :, 1], axis=1)).clip(1e-12)
+    H = H * (np.where(depth < 0, -1.0, 1.0) / size)[:, None, None]
+    matrix = np.stack([H[..., 0], H[..., 1], np.cross(H[..., 0], H[..., 1])], axis=-1)
+    U, _, Vh = np.linalg.svd(matrix)
+    turn = np.linalg.det(U @ Vh)
+    U = np.concatenate([U[..., :2], U[..., 2:] * turn[:, None, None]], axis=-1)
     return U @ Vh, H[..., 2]
 
 
-def _undistort(camera: Camera, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _undistort(camera: Camera, u: Array, v: Array) -> tuple[Array, Array, Array]:
     """Coordinates x/z and y/z of the rays through pixels, by Newton's method, and whether it found them."""
     fu, fv, pu, pv = camera.intrinsics
     k = camera.coefficients
     x, y = (u - pu) / fu, (v - pv) / fv
     if camera.distortion == "equidistant":
-        r = torch.hypot(x, y)
-        theta = r.clone()
+        r = np.hypot(x, y)
+        theta = r
         for _ in range(8):
             s = theta * theta
             value = theta * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
             slope = 1 + s * (3 * k[0] + s * (5 * k[1] + s * (7 * k[2] + s * 9 * k[3])))
             theta = theta - (value - r) / slope
-        found = ((value - r).abs() < 1e-6) & (theta < _WIDEST) & (theta >= 0)
-        stretch = torch.where(found, theta.clamp(0.0, _WIDEST).tan(), 0.0) / r.clamp_min(1e-12)
+        found = (np.abs(value - r) < 1e-6) & (theta < _WIDEST) & (theta >= 0)
+        stretch = np.where(found, np.tan(theta.clip(0.0, _WIDEST)), 0.0) / r.clip(1e-12)
         return x * stretch, y * stretch, found
-    model, one = _MODELS[camera.distortion], torch.ones_like(x)
+    model, one = _MODELS[camera.distortion], np.ones_like(x)
     a, b = x, y
     for _ in range(8):
         at = (a, b, one)
@@ -199,38 +197,38 @@ def _undistort(camera: Camera, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Te
         determinant = paa * qab - pab * qaa
         da, db = (qab * (p - x) - pab * (q - y)) / determinant, (paa * (q - y) - qaa * (p - x)) / determinant
         a, b = a - da, b - db
-        if bool(torch.maximum(da.abs(), db.abs()).max() < 1e-7):
+        if max(np.abs(da).max(), np.abs(db).max()) < 1e-7:
             break
-    found = (torch.hypot(da, db) < 1e-6) & (torch.hypot(a, b) < math.tan(_WIDEST))
-    return torch.where(found, a, 0.0), torch.where(found, b, 0.0), found
+    found = (np.hypot(da, db) < 1e-6) & (np.hypot(a, b) < math.tan(_WIDEST))
+    return np.where(found, a, 0.0), np.where(found, b, 0.0), found
 
 
-def _homography(x: Tensor, y: Tensor, a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
+def _homography(x: Array, y: Array, a: Array, b: Array, weight: Array) -> Array:
     """(B, 3, 3) from the plane (x, y) to the plane (a, b), by the normalised direct linear transform."""
-    n = weight.sum(dim=1, keepdim=True).clamp_min(1.0)
+    n = weight.sum(axis=1, keepdims=True).clip(1.0)
 
-    def normal(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def normal(p: Array, q: Array) -> tuple[Array, Array, Array]:
         """Coordinates with mean 0 and mean distance sqrt(2), and the matrix that makes them so."""
-        centre = (weight * p).sum(1, keepdim=True) / n, (weight * q).sum(1, keepdim=True) / n
+        centre = (weight * p).sum(1, keepdims=True) / n, (weight * q).sum(1, keepdims=True) / n
         p, q = p - centre[0], q - centre[1]
-        scale = math.sqrt(2.0) / ((weight * torch.hypot(p, q)).sum(1, keepdim=True) / n).clamp_min(1e-12)
-        zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+        scale = math.sqrt(2.0) / ((weight * np.hypot(p, q)).sum(1, keepdims=True) / n).clip(1e-12)
+        zero, one = np.zeros_like(scale), np.ones_like(scale)
         rows = ([scale, zero, -scale * centre[0]], [zero, scale, -scale * centre[1]], [zero, zero, one])
-        return p * scale, q * scale, torch.stack([torch.cat(row, dim=1) for row in rows], dim=1)
+        return p * scale, q * scale, np.stack([np.concatenate(row, axis=1) for row in rows], axis=1)
 
     x, y, from_board = normal(x, y)
     a, b, from_image = normal(a, b)
-    m = torch.stack([x, y, torch.ones_like(x)], dim=1)  # (B, 3, C)
+    m = np.stack([x, y, np.ones_like(x)], axis=1)  # (B, 3, C)
 
-    def moment(factor: Tensor) -> Tensor:
-        return (m * (weight * factor)[:, None]) @ m.mT
+    def moment(factor: Array) -> Array:
+        return (m * (weight * factor)[:, None]) @ m.swapaxes(1, 2)
 
-    S, A, B, both = moment(torch.ones_like(a)), moment(-a), moment(-b), moment(a * a + b * b)
-    zero = torch.zeros_like(S)
+    S, A, B, both = moment(np.ones_like(a)), moment(-a), moment(-b), moment(a * a + b * b)
+    zero = np.zeros_like(S)
     rows = ([S, zero, A], [zero, S, B], [A, B, both])
-    matrix = torch.cat([torch.cat(row, dim=2) for row in rows], dim=1)
-    H = torch.linalg.eigh(matrix).eigenvectors[..., 0].reshape(-1, 3, 3)
-    return torch.linalg.solve(from_image, H @ from_board)
+    matrix = np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
+    H = np.linalg.eigh(matrix)[1][..., 0].reshape(-1, 3, 3)
+    return np.linalg.solve(from_image, H @ from_board)
 
 
 # ---------------------------------------------------------------------- least squares on pixels
@@ -239,13 +237,13 @@ def _homography(x: Tensor, y: Tensor, a: Tensor, b: Tensor, weight: Tensor) -> T
 class _State(NamedTuple):
     """Robust cost (B,), residuals (2, B, C) px, normal matrix (B, 6, 6) and gradient (B, 6)."""
 
-    cost: Tensor
-    residual: Tensor
-    matrix: Tensor
-    gradient: Tensor
+    cost: Array
+    residual: Array
+    matrix: Array
+    gradient: Array
 
 
-def _linearize(camera: Camera, block: _Block, R: Tensor, t: Tensor) -> _State:
+def _linearize(camera: Camera, block: _Block, R: Array, t: Array) -> _State:
     """At poses `p_cam = R p_board + t`; steps (v, w) change p_cam by v + w x p_cam."""
     model, k = _MODELS[camera.distortion], camera.coefficients
     fu, fv, pu, pv = camera.intrinsics
@@ -253,57 +251,53 @@ def _linearize(camera: Camera, block: _Block, R: Tensor, t: Tensor) -> _State:
     p = [R[:, i, 0, None] * x + R[:, i, 1, None] * y + t[:, i, None] for i in range(3)]
     point, shown = model._visible(tuple(p))
     plane = model._distort(point, k)
-    there = block.there.to(torch.float64) * shown
-    residual = torch.stack([(fu * plane[0] + pu - block.u) * there, (fv * plane[1] + pv - block.v) * there])
-    length = (residual[0] * residual[0] + residual[1] * residual[1]).sqrt()
+    there = block.there.astype(np.float64) * shown
+    residual = np.stack([(fu * plane[0] + pu - block.u) * there, (fv * plane[1] + pv - block.v) * there])
+    length = np.sqrt(residual[0] * residual[0] + residual[1] * residual[1])
     far = length > _OUTLIER
-    weight = torch.where(far, _OUTLIER / length.clamp_min(_OUTLIER), 1.0) * there
-    cost = torch.where(far, _OUTLIER * (2.0 * length - _OUTLIER), length.square())
+    weight = np.where(far, _OUTLIER / length.clip(_OUTLIER), 1.0) * there
+    cost = np.where(far, _OUTLIER * (2.0 * length - _OUTLIER), length * length)
     cost = cost + (block.there & (shown == 0)) * _HIDDEN**2
-    root = weight.sqrt()
+    root = np.sqrt(weight)
     rows = []
     for focal, unit, e in zip((fu, fv), ((1.0, 0.0), (0.0, 1.0)), residual, strict=True):
         (gx, gy, gz), _ = model._distort_reverse(point, k, unit)
         f = focal * root
         gx, gy, gz = gx * f, gy * f, gz * f
         turning = (p[1] * gz - p[2] * gy, p[2] * gx - p[0] * gz, p[0] * gy - p[1] * gx)
-        rows.append(torch.stack([gx, gy, gz, *turning, e * root], dim=1))
-    J = torch.cat(rows, dim=2)  # (B, 7, 2C)
-    gram = J @ J.mT
-    return _State(cost.sum(dim=1), residual, gram[:, :6, :6], gram[:, :6, 6])
+        rows.append(np.stack([gx, gy, gz, *turning, e * root], axis=1))
+    J = np.concatenate(rows, axis=2)  # (B, 7, 2C)
+    gram = J @ J.swapaxes(1, 2)
+    return _State(cost.sum(axis=1), residual, gram[:, :6, :6], gram[:, :6, 6])
 
 
-def _refine(camera: Camera, block: _Block, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _refine(camera: Camera, block: _Block, R: Array, t: Array) -> tuple[Array, Array, Array]:
     """Poses at the minimum of the robust cost and their residuals (2, B, C), px."""
     state = _linearize(camera, block, R, t)
-    damping = torch.full_like(state.cost, 1e-6)
-    done = torch.zeros_like(state.cost, dtype=torch.bool)
+    damping = np.full_like(state.cost, 1e-6)
+    done = np.zeros_like(state.cost, dtype=bool)
     for _ in range(_ITERATIONS):
-        diagonal = state.matrix.diagonal(dim1=1, dim2=2)
-        damped = state.matrix + torch.diag_embed(damping[:, None] * diagonal + 1e-12)
-        step = -torch.linalg.solve_ex(damped, state.gradient).result
-        turn = SO3.to_matrix(SO3.exp(step[:, 3:], validate=False), validate=False)
+        diagonal = state.matrix[:, range(6), range(6)]
+        damped = state.matrix.copy()
+        damped[:, range(6), range(6)] += damping[:, None] * diagonal + 1e-9
+        step = -np.linalg.solve(damped, state.gradient[..., None])[..., 0]
+        turn = SO3.to_matrix(SO3.exp(torch.from_numpy(step[:, 3:]))).numpy()
         tried = turn @ R, (turn @ t[..., None])[..., 0] + step[:, :3]
         after = _linearize(camera, block, *tried)
         better = after.cost <= state.cost
         done |= (
-            ((state.cost - after.cost).abs() <= _SETTLED * state.cost)
+            (np.abs(state.cost - after.cost) <= _SETTLED * state.cost)
             | (state.cost < 1e-12)
             | (damping > 1e8)
         )
-        R, t = _choose(better, tried, (R, t))
+        R, t = np.where(better[:, None, None], tried[0], R), np.where(better[:, None], tried[1], t)
         state = _State(
-            *_choose(better, after[:1], state[:1]),
-            torch.where(better[None, :, None], after.residual, state.residual),
-            *_choose(better, after[2:], state[2:]),
+            np.where(better, after.cost, state.cost),
+            np.where(better[:, None], after.residual, state.residual),
+            np.where(better[:, None, None], after.matrix, state.matrix),
+            np.where(better[:, None], after.gradient, state.gradient),
         )
-        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp_min(1e-12)
-        if bool(done.all()):
+        damping = np.where(better, damping * 0.1, damping * 10.0).clip(1e-12)
+        if done.all():
             break
     return R, t, state.residual
-
-
-def _choose(condition: Tensor, yes: Sequence[Tensor], no: Sequence[Tensor]) -> list[Tensor]:
-    return [
-        torch.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in zip(yes, no, strict=True)
-    ]

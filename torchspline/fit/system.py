@@ -228,7 +228,7 @@ def _inner(a: Array, b: Array) -> Array:
 
     The product takes a millisecond; waiting for a thread that another process keeps off its core takes hundreds.
     """
-    right = b.reshape(len(b), -1)
+    right = b.reshape(len(b), int(np.prod(b.shape[1:])))  # -1 cannot be told where there are no rows
     pieces, rest = divmod(len(a), _PIECE)
     whole = pieces * _PIECE
     first, second = (x[:whole].reshape(pieces, _PIECE, x.shape[1]) for x in (a, right))
