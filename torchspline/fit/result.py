@@ -110,6 +110,22 @@ class Result:
         rows = sum(term.numbers for term in self._terms())
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
+    @cached_property
+    def redundancy(self) -> dict[str, float]:
+        """How many of the numbers of each residual were left to check the solution, by name as in `residuals`.
+
+        The trace of `I - J (J^T W J)^-1 J^T W`: numbers measured minus those that unknowns went along with. The weighted
+        sum of squares of a residual over its redundancy is 1 if its standard deviation was right [Foerstner 1979].
+
+        Raises:
+            ValueError: the measurements do not determine all unknowns.
+        """
+        factor, found = self._determined(), {}
+        for name, term in zip(self.residuals, self._terms(), strict=True):
+            own = self._linearizer.system_of(term, self._state)
+            found[name] = term.numbers - factor.trace(own)
+        return found
+
     # ------------------------------------------------------------------ how sure
 
     @cached_property
@@ -146,6 +162,22 @@ class Result:
     def standard_deviation(self, variable: Variable) -> Tensor:
         """Square roots of the diagonal of `covariance`."""
         return self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def point_deviation(self, spline: BSpline) -> Tensor:
+        """Standard deviations of the steps of a spline's control points, `(M, D)`; 0 for those that stayed.
+
+        Raises:
+            ValueError: the measurements do not determine all unknowns.
+        """
+        columns = self._linearizer.model.columns[id(spline)]
+        there = columns >= 0
+        variances = np.zeros(columns.shape)
+        variances[there] = self._determined().inverse(columns[there], columns[there])
+        return torch.from_numpy(np.sqrt(variances))
+
+    def is_estimated(self, variable: Variable) -> bool:
+        """Whether a variable was among the unknowns, not frozen."""
+        return id(variable) in self._linearizer.model.columns
 
     def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
         """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.

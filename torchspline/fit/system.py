@@ -50,6 +50,10 @@ class Factor(ABC):
     def inverse(self, i: Array, j: Array) -> Array:
         """Elements of the inverse at columns `i`, `j` of one shape, tied together by measurements or of the border."""
 
+    @abstractmethod
+    def trace(self, other: "System") -> float:
+        """Of the inverse times the `J^T J` of some of the same measurements."""
+
 
 class System(ABC):
     """`J^T J` and `J^T r`, added up chunk by chunk."""
@@ -187,6 +191,21 @@ class BandFactor(Factor):
         result[inner] += self._band_inverse(i[inner], j[inner])
         return result
 
+    def trace(self, other: System) -> float:
+        assert isinstance(other, BandSystem)
+        n, m = self.n, len(self.corner)
+        corner = self._lapack.dpotrs(self.corner, np.eye(m), lower=1)[0] if m else np.zeros((0, 0))
+        # Columns of the inverse: A^-1 B C B^T A^-1 and -A^-1 B C beside the band's own inverse.
+        carried = self.inverse_border @ corner
+        total = -2.0 * float(np.einsum("nm,nm->", carried, other.border))
+        total += float(np.einsum("ab,ab->", corner, other.corner + np.tril(other.corner, -1).T))
+        for d in range(min(other.band.shape[1], n)):
+            i = np.arange(d, n)
+            inverse = self._band_inverse(i, i - d)
+            inverse += np.einsum("na,na->n", carried[d:], self.inverse_border[: n - d])
+            total += (1.0 if d == 0 else 2.0) * float(inverse @ other.band[: n - d, d])
+        return total
+
     def _band_inverse(self, i: Array, j: Array) -> Array:
         i, j = np.maximum(i, j), np.minimum(i, j)
         diagonal, below = self._inverse_blocks
@@ -308,3 +327,8 @@ class SparseFactor(Factor):
         unit = np.zeros((self._lu.shape[0], len(needed)))
         unit[needed, np.arange(len(needed))] = 1.0
         return self._lu.solve(unit)[i, which.reshape(j.shape)]
+
+    def trace(self, other: System) -> float:
+        assert isinstance(other, SparseSystem)
+        matrix = other.matrix().tocoo()
+        return float(self.inverse(matrix.row, matrix.col) @ matrix.data)
