@@ -12,7 +12,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.fit.model import State, Unknown
 from torchspline.fit.solver import Trace
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
@@ -129,19 +129,38 @@ class Result:
     # ------------------------------------------------------------------ how sure
 
     @cached_property
-    def _factor(self) -> Factor:
+    def _undamped(self) -> Factor | None:
+        """None where it is singular."""
         try:
             return self._system.factor(np.zeros(self._linearizer.model.total))
         except SingularError:
+            return None
+
+    @property
+    def _factor(self) -> Factor:
+        if self._undamped is None:
             open_ = "; ".join(map(str, self.observability)) or "rounding leaves no direction to name"
-            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}") from None
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}")
+        return self._undamped
 
     def _determined(self) -> Factor:
-        if self.observability:
+        if not self._surely_determined and self.observability:
             raise ValueError(
                 f"covariance: the measurements do not determine all unknowns: {'; '.join(map(str, self.observability))}"
             )
         return self._factor
+
+    @cached_property
+    def _surely_determined(self) -> bool:
+        """Whether no direction is open, without looking for them.
+
+        The smallest eigenvalue is at least one over the trace of the inverse, here of the scaled equations.
+        """
+        diagonal = self._system.diagonal()
+        if not isinstance(self._system, BandSystem) or not (diagonal > 0).all() or self._undamped is None:
+            return False
+        inverse = self._undamped.diagonal()
+        return bool((inverse > 0).all()) and float(np.einsum("n,n->", inverse, diagonal)) < 1.0 / _OPEN
 
     def covariance(self, variable: Variable) -> Tensor:
         """Of a variable's step: `(dimension, dimension)`, or `(L, dimension, dimension)` for several.
@@ -219,6 +238,8 @@ class Result:
     @cached_property
     def observability(self) -> list[OpenDirection]:
         """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
+        if self._surely_determined:
+            return []
         diagonal = self._system.diagonal()
         dead = np.flatnonzero(diagonal <= 0)
         found = []
