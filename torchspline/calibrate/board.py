@@ -30,8 +30,8 @@ _NARROW = 0.03
 _OUTLIER = 2.0
 #: Root mean square (px) above which an image does not show this board through this camera.
 MISFIT = 5.0
-#: A corner behind the camera costs as much as an error of this many pixels.
-_HIDDEN = 1e3
+#: A corner behind the camera counts as an error of this many pixels.
+_HIDDEN = 1e4
 _ITERATIONS = 30
 #: The cost of an image has settled when a step changes it by less than this share.
 _SETTLED = 1e-7
@@ -252,12 +252,14 @@ def _linearize(camera: Camera, block: _Block, R: Array, t: Array) -> _State:
     point, shown = model._visible(tuple(p))
     plane = model._distort(point, k)
     there = block.there.astype(np.float64) * shown
-    residual = np.stack([(fu * plane[0] + pu - block.u) * there, (fv * plane[1] + pv - block.v) * there])
+    hidden = _HIDDEN * (block.there & (shown == 0))
+    residual = np.stack(
+        [(fu * plane[0] + pu - block.u) * there + hidden, (fv * plane[1] + pv - block.v) * there]
+    )
     length = np.sqrt(residual[0] * residual[0] + residual[1] * residual[1])
     far = length > _OUTLIER
     weight = np.where(far, _OUTLIER / length.clip(_OUTLIER), 1.0) * there
     cost = np.where(far, _OUTLIER * (2.0 * length - _OUTLIER), length * length)
-    cost = cost + (block.there & (shown == 0)) * _HIDDEN**2
     root = np.sqrt(weight)
     rows = []
     for focal, unit, e in zip((fu, fv), ((1.0, 0.0), (0.0, 1.0)), residual, strict=True):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -87,10 +88,13 @@ class Corners:
             TypeError, ValueError: not truth values, not one an image.
         """
         _column("images", images, torch.bool, (len(self.t_ns),))
-        rows = images[self.frame]
-        numbers = torch.cumsum(images, 0) - 1
-        columns = {name: getattr(self, name)[rows] for name in ("uv", "xyz", "tag_id", "corner")}
-        return replace(self, t_ns=self.t_ns[images], frame=numbers[self.frame[rows]], **columns)
+        # NumPy's indexing: PyTorch would spread these short copies over threads and wait for them.
+        kept, frame = images.numpy(), self.frame.numpy()
+        rows = np.flatnonzero(kept[frame])
+        numbers = np.cumsum(kept) - 1
+        columns = {name: getattr(self, name).numpy()[rows] for name in ("uv", "xyz", "tag_id", "corner")}
+        columns |= {"t_ns": self.t_ns.numpy()[kept], "frame": numbers[frame[rows]]}
+        return replace(self, **{name: torch.from_numpy(x) for name, x in columns.items()})
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,9 @@ _ORDER = 6
 _STRAY = 50.0
 #: IMU readings are averaged until only so many are left for each image: faster, and all that the first spline can use.
 _READINGS_PER_IMAGE = 2.5
-#: Images of each camera that are tried with the intrinsics of the others, too, and the share at which those do better.
-_TRIED, _BETTER = 50, 0.9
+#: Images of each camera that are tried with the intrinsics of the others, too, and by how much those have to do better
+#: (difference of mean logarithms of the RMS, a camera): two units of one model differ by a tenth.
+_TRIED, _BETTER = 50, 0.05
 #: Clocks farther apart than this (s) are worth a note, as are directions of gravity (rad).
 _APART, _TILTED = 0.1, math.radians(3.0)
 
@@ -185,7 +186,7 @@ def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
     count = len(recording.cameras)
     if count < 2:
         return ""
-    cost = np.full((count, count), math.inf)
+    cost, median = np.zeros((count, count)), np.zeros((count, count))
     for i, (corners, board) in enumerate(zip(recording.corners, boards, strict=True)):
         usable = torch.nonzero((board.reason != 1) & (board.reason != 2)).flatten()
         if not len(usable):
@@ -195,14 +196,15 @@ def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
         some = corners.select(chosen)
         for j, camera in enumerate(recording.cameras):
             rms = board.rms[chosen] if i == j else board_poses(camera, some).rms
-            cost[i, j] = float(rms.median())
+            # Image by image: they differ among themselves by more than the intrinsics make.
+            cost[i, j], median[i, j] = float((rms + 0.01).log().mean()), float(rms.median())
     rows, columns = linear_sum_assignment(cost)
-    if cost[rows, columns].sum() > _BETTER * np.trace(cost):
+    if cost[rows, columns].sum() > np.trace(cost) - count * _BETTER:
         return ""
     names = [camera.name for camera in recording.cameras]
     listed = "; ".join(
-        f"the corners of {names[i]} fit the intrinsics of {names[j]} with {cost[i, j]:.2f} px RMS, their own with "
-        f"{cost[i, i]:.2f} px"
+        f"the corners of {names[i]} fit the intrinsics of {names[j]} with {median[i, j]:.2f} px RMS, their own with "
+        f"{median[i, i]:.2f} px"
         for i, j in zip(rows, columns, strict=True)
         if i != j
     )
