@@ -1,7 +1,6 @@
 """The least-squares problem of a calibration: its unknowns, where they start, and the measurements of each sensor."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from torchspline.calibrate.images import PROJECTIONS, ImageBlock
 from torchspline.calibrate.recording import Recording
+from torchspline.calibrate.start import Start
 from torchspline.fit.losses import Loss
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Argument, Clock, Residual
@@ -25,26 +25,13 @@ from torchspline.splines.bspline import BSpline
 NS = 1_000_000_000
 #: Trajectories by representation.
 GROUPS = {"split": "R3xSO3", "joint": "SE3"}
+#: What may be estimated besides trajectory, extrinsics, gravity and biases.
+CHOICES = ("time_offset", "intrinsics", "line_delay", "imu_scaling")
 #: How long before the first and after the last image the trajectory goes on, where the IMU does, s.
 _PAD = 0.1
 #: Off-diagonal numbers of an accelerometer's scaling that would turn the frame of the IMU, and what they may be.
 _ABOVE_DIAGONAL, _FIXED, _FREE = (1, 2, 5), 1e-9, 1.0
 _UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-
-
-class Guess(NamedTuple):
-    """Where a solution starts; see `start.Start`, of which this is what the problem needs."""
-
-    #: SE3 of each camera, camera to IMU, and s.
-    T_imu_cam: Sequence[Tensor]
-    time_offset: Sequence[float]
-    #: (3,) acceleration in the frame of the board.
-    gravity: Tensor
-    gyro_bias: Tensor
-    accel_bias: Tensor
-    #: IMU in the frame of the board: (P,) int64 on the IMU's clock, ascending, and (P, 7).
-    t_ns: Tensor
-    poses: Tensor
 
 
 class Options(NamedTuple):
@@ -57,6 +44,7 @@ class Options(NamedTuple):
     bias_spacing: float | None
     pixel_sigma: float
     loss: Loss | None
+    imu_loss: Loss | None
 
 
 @dataclass
@@ -97,36 +85,39 @@ class Layout:
     cameras: list[CameraUnknowns] = field(default_factory=list)
     imus: list[ImuUnknowns] = field(default_factory=list)
 
+    @property
+    def residuals(self) -> list[Residual]:
+        """Of all sensors."""
+        return [x for u in self.imus for x in (u.gyroscope, u.accelerometer)] + [u.residual for u in self.cameras]
 
-def build(recording: Recording, guess: Guess, options: Options, scales: dict[str, float]) -> Layout:
+
+def build(recording: Recording, start: Start, options: Options) -> Layout:
     """All sensors on one trajectory of the first IMU, on its clock.
 
-    Args:
-        scales: by the name of a residual, what its standard deviations are multiplied by.
     Raises:
         ValueError: sensors that share no stretch of time, gaps in the readings of the IMU.
     """
-    trajectory = _trajectory(recording, guess, options)
+    trajectory = _trajectory(recording, start, options)
     gravity = Variable(
-        "gravity", guess.gravity * (recording.gravity / guess.gravity.norm()), sphere=True
+        "gravity", start.gravity * (recording.gravity / start.gravity.norm()), sphere=True
     )
     layout = Layout(Problem(trajectory), trajectory, gravity)
     for i in range(len(recording.imus)):
-        _add_imu(layout, recording, i, guess, options, scales)
+        _add_imu(layout, recording, i, start, options)
     for i in range(len(recording.cameras)):
-        _add_camera(layout, recording, i, guess, options, scales)
+        _add_camera(layout, recording, i, start, options)
     return layout
 
 
 # ---------------------------------------------------------------------- the trajectory
 
 
-def span(recording: Recording, guess: Guess) -> tuple[int, int]:
+def span(recording: Recording, start: Start) -> tuple[int, int]:
     """First and last nanosecond, on the clock of the first IMU, at which it and a camera measured."""
     imu, pad = recording.imus[0], round(_PAD * NS)
     stamps = [
         (int(c.t_ns[0]) + round(offset * NS), int(c.t_ns[-1]) + round(offset * NS))
-        for c, offset in zip(recording.corners, guess.time_offset, strict=True)
+        for c, offset in zip(recording.corners, start.time_offset.tolist(), strict=True)
         if len(c.t_ns)
     ]
     if not stamps or not len(imu):
@@ -142,8 +133,8 @@ def span(recording: Recording, guess: Guess) -> tuple[int, int]:
     return first, last
 
 
-def _trajectory(recording: Recording, guess: Guess, options: Options) -> BSpline:
-    first, last = span(recording, guess)
+def _trajectory(recording: Recording, start: Start, options: Options) -> BSpline:
+    first, last = span(recording, start)
     dt = max(round(options.spacing * NS), 1)
     segments = (last - first) // dt
     if segments < 1:
@@ -153,8 +144,8 @@ def _trajectory(recording: Recording, guess: Guess, options: Options) -> BSpline
     _check_gaps(recording.imus[0], first, first + segments * dt, options)
     count = segments + options.order - 1
     t = (np.arange(count) - 0.5 * (options.order - 2)) * (dt / NS)
-    known = (guess.t_ns - first).numpy() / NS
-    points = _through(known, guess.poses.numpy(), np.clip(t, known[0], known[-1]))
+    known = (start.t_ns - first).numpy() / NS
+    points = _through(known, start.T_board_imu.numpy(), np.clip(t, known[0], known[-1]))
     return BSpline(
         torch.from_numpy(points), group=Group(GROUPS[options.representation]), order=options.order, dt_ns=dt, t0_ns=first,
         learnable=False,
@@ -194,45 +185,46 @@ def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None
 
 
 def _add_imu(
-    layout: Layout, recording: Recording, i: int, guess: Guess, options: Options, scales: dict[str, float]
+    layout: Layout, recording: Recording, i: int, start: Start, options: Options
 ) -> None:
     record, noise = recording.imus[i], recording.noise[i]
     first, last = layout.trajectory.domain
-    inside = (record.time_ns >= first) & (record.time_ns <= last)
-    part = record.window(int(first), int(last))
+    shift = round(float(start.imu_time_offset[i]) * NS)
+    inside = (record.time_ns - shift >= first) & (record.time_ns - shift <= last)
+    part = record.window(int(first) + shift, int(last) + shift)
     if len(part) < 2:
         raise ValueError(f"{record.source or f'imus[{i}]'}: expected readings while cameras saw the board, got none")
     rate = math.sqrt((len(part) - 1) * NS / int(part.time_ns[-1] - part.time_ns[0]))
     own: dict[str, Variable] = {}
     clock = None
     if i > 0:
-        own["rotation"] = Variable(f"imu{i} rotation", _turned(recording.imus[0], part), group=SO3)
-        own["lever_arm"] = Variable(f"imu{i} lever arm", torch.zeros(3, dtype=torch.float64))
-        ahead = Variable(f"imu{i} ahead", torch.zeros(1, dtype=torch.float64))
-        clock = Clock(offset=ahead)
-    gyro_start, accel_start = (guess.gyro_bias, guess.accel_bias) if i == 0 else (torch.zeros(3), torch.zeros(3))
-    gyro_bias = _bias(f"imu{i} gyro bias", gyro_start, layout.trajectory, options)
-    accel_bias = _bias(f"imu{i} accel bias", accel_start, layout.trajectory, options)
+        own["rotation"] = Variable(f"imu{i} rotation", start.T_imu0_imu[i, 3:], group=SO3)
+        own["lever_arm"] = Variable(f"imu{i} lever arm", start.T_imu0_imu[i, :3])
+        # `t_imu_i = t_imu0 + offset`, as a `Clock` has it.
+        own["ahead"] = Variable(f"imu{i} ahead", start.imu_time_offset[i : i + 1])
+        clock = Clock(offset=own["ahead"])
+    gyro_bias = _bias(f"imu{i} gyro bias", start.gyro_bias[i], layout.trajectory, options)
+    accel_bias = _bias(f"imu{i} accel bias", start.accel_bias[i], layout.trajectory, options)
     gyro_extra: dict[str, Argument] = {k: v for k, v in own.items() if k == "rotation"}
-    accel_extra: dict[str, Argument] = {**own}
+    accel_extra: dict[str, Argument] = {k: v for k, v in own.items() if k != "ahead"}
     if "imu_scaling" in options.estimate:
         for name, extra in (("gyro", gyro_extra), ("accel", accel_extra)):
             extra["scaling"] = Variable(f"imu{i} {name} scaling", torch.tensor(_UNIT, dtype=torch.float64))
     names = f"imu{i} gyroscope", f"imu{i} accelerometer"
     gyroscope = Gyroscope(
-        part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate * scales.get(names[0], 1.0),
-        loss=options.loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
+        part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate,
+        loss=options.imu_loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
     )  # fmt: skip
     accelerometer = Accelerometer(
-        part.time_ns, part.accelerometer, sigma=noise.accel_density * rate * scales.get(names[1], 1.0),
-        loss=options.loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
+        part.time_ns, part.accelerometer, sigma=noise.accel_density * rate,
+        loss=options.imu_loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
     )  # fmt: skip
     problem = layout.problem
     problem.add(gyroscope)
     problem.add(accelerometer)
     found = ImuUnknowns(gyro_bias, accel_bias, gyroscope, accelerometer, inside)
     if i > 0:
-        found.rotation, found.lever_arm, found.ahead = own["rotation"], own["lever_arm"], ahead
+        found.rotation, found.lever_arm, found.ahead = own["rotation"], own["lever_arm"], own["ahead"]
     if "imu_scaling" in options.estimate:
         found.gyro_scaling, found.accel_scaling = gyro_extra["scaling"], accel_extra["scaling"]
         # The frame of the IMU is that of its accelerometer: x along its first axis, y in the plane of the first two.
@@ -243,31 +235,23 @@ def _add_imu(
     layout.imus.append(found)
 
 
-def _bias(name: str, start: Tensor, trajectory: BSpline, options: Options) -> Variable | BSpline:
+def _bias(name: str, value: Tensor, trajectory: BSpline, options: Options) -> Variable | BSpline:
     """One for all times, or a spline over the trajectory's time."""
     if options.bias_spacing is None:
-        return Variable(name, start.double())
+        return Variable(name, value)
     first, last = trajectory.domain
     dt, order = round(options.bias_spacing * NS), 4
     count = -(-int(last - first) // dt) + order - 1
-    points = start.double().repeat(count, 1)
+    points = value.repeat(count, 1)
     return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=int(first), learnable=False)
 
 
-def _turned(reference: ImuRecord, other: ImuRecord) -> Tensor:
-    """Rotation of another IMU in the first one, by what both gyroscopes read at the same stamps [Wahba 1965]."""
-    at = other.seconds(int(reference.time_ns[0])).numpy()
-    seen = np.stack([np.interp(at, reference.time.numpy(), x) for x in reference.gyroscope.numpy().T], axis=1)
-    seen, own = (x - x.mean(axis=0) for x in (seen, other.gyroscope.numpy()))
-    return torch.from_numpy(Rotation.align_vectors(seen, own)[0].as_quat(scalar_first=True))
-
-
 def _add_camera(
-    layout: Layout, recording: Recording, i: int, guess: Guess, options: Options, scales: dict[str, float]
+    layout: Layout, recording: Recording, i: int, start: Start, options: Options
 ) -> None:
     camera, corners, problem = recording.cameras[i], recording.corners[i], layout.problem
     number, name = f"cam{i}", f"cam{i} corners"
-    offset = float(guess.time_offset[i])
+    offset = float(start.time_offset[i])
     first, last = layout.trajectory.domain
     near = corners.t_ns + round(offset * NS)
     images = (near >= first) & (near <= last)
@@ -278,12 +262,12 @@ def _add_camera(
         )
     ahead = Variable(f"{number} ahead", torch.tensor([-offset], dtype=torch.float64))
     extrinsics = Variable(
-        f"{number} extrinsics", SE3.normalize(guess.T_imu_cam[i].double()), group=SE3
+        f"{number} extrinsics", SE3.normalize(start.T_imu_cam[i]), group=SE3
     )
     intrinsics = Variable(f"{number} intrinsics", camera.parameters)
     frame = (torch.cumsum(images, 0) - 1)[corners.frame[kept]]
     uv, xyz, stamps = corners.uv[kept], corners.xyz[kept], corners.t_ns[images]
-    sigma = options.pixel_sigma * scales.get(name, 1.0)
+    sigma = options.pixel_sigma
     delay = None
     shared = {"intrinsics": intrinsics, "T_body_camera": extrinsics}
     if "line_delay" in options.estimate:

@@ -259,6 +259,12 @@ class Linearizer:
             term.add_to(system, state)
         return system
 
+    def system_of(self, term: Term | Bends | BoundPrior, state: State) -> System:
+        """What one of the terms has in the normal equations."""
+        system = self._empty(state)
+        term.add_to(system, state)
+        return system
+
     def _empty(self, state: State) -> System:
         """A band as wide as the measurements want it now, or a sparse matrix if that is much wider than one needs."""
         model = self.model

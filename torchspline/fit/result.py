@@ -12,7 +12,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.fit.model import State, Unknown
 from torchspline.fit.solver import Trace
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
@@ -110,22 +110,57 @@ class Result:
         rows = sum(term.numbers for term in self._terms())
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
+    @cached_property
+    def redundancy(self) -> dict[str, float]:
+        """How many of the numbers of each residual were left to check the solution, by name as in `residuals`.
+
+        The trace of `I - J (J^T W J)^-1 J^T W`: numbers measured minus those that unknowns went along with. The weighted
+        sum of squares of a residual over its redundancy is 1 if its standard deviation was right [Foerstner 1979].
+
+        Raises:
+            ValueError: the measurements do not determine all unknowns.
+        """
+        factor, found = self._determined(), {}
+        for name, term in zip(self.residuals, self._terms(), strict=True):
+            own = self._linearizer.system_of(term, self._state)
+            found[name] = term.numbers - factor.trace(own)
+        return found
+
     # ------------------------------------------------------------------ how sure
 
     @cached_property
-    def _factor(self) -> Factor:
+    def _undamped(self) -> Factor | None:
+        """None where it is singular."""
         try:
             return self._system.factor(np.zeros(self._linearizer.model.total))
         except SingularError:
+            return None
+
+    @property
+    def _factor(self) -> Factor:
+        if self._undamped is None:
             open_ = "; ".join(map(str, self.observability)) or "rounding leaves no direction to name"
-            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}") from None
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}")
+        return self._undamped
 
     def _determined(self) -> Factor:
-        if self.observability:
+        if not self._surely_determined and self.observability:
             raise ValueError(
                 f"covariance: the measurements do not determine all unknowns: {'; '.join(map(str, self.observability))}"
             )
         return self._factor
+
+    @cached_property
+    def _surely_determined(self) -> bool:
+        """Whether no direction is open, without looking for them.
+
+        The smallest eigenvalue is at least one over the trace of the inverse, here of the scaled equations.
+        """
+        diagonal = self._system.diagonal()
+        if not isinstance(self._system, BandSystem) or not (diagonal > 0).all() or self._undamped is None:
+            return False
+        inverse = self._undamped.diagonal()
+        return bool((inverse > 0).all()) and float(np.einsum("n,n->", inverse, diagonal)) < 1.0 / _OPEN
 
     def covariance(self, variable: Variable) -> Tensor:
         """Of a variable's step: `(dimension, dimension)`, or `(L, dimension, dimension)` for several.
@@ -146,6 +181,22 @@ class Result:
     def standard_deviation(self, variable: Variable) -> Tensor:
         """Square roots of the diagonal of `covariance`."""
         return self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+
+    def point_deviation(self, spline: BSpline) -> Tensor:
+        """Standard deviations of the steps of a spline's control points, `(M, D)`; 0 for those that stayed.
+
+        Raises:
+            ValueError: the measurements do not determine all unknowns.
+        """
+        columns = self._linearizer.model.columns[id(spline)]
+        there = columns >= 0
+        variances = np.zeros(columns.shape)
+        variances[there] = self._determined().inverse(columns[there], columns[there])
+        return torch.from_numpy(np.sqrt(variances))
+
+    def is_estimated(self, variable: Variable) -> bool:
+        """Whether a variable was among the unknowns, not frozen."""
+        return id(variable) in self._linearizer.model.columns
 
     def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
         """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.
@@ -187,6 +238,8 @@ class Result:
     @cached_property
     def observability(self) -> list[OpenDirection]:
         """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
+        if self._surely_determined:
+            return []
         diagonal = self._system.diagonal()
         dead = np.flatnonzero(diagonal <= 0)
         found = []

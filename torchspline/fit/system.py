@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchspline.fit.model import Model
 from torchspline.kernels.assemble import add_to_band, add_to_blocks
+from torchspline.kernels.band import inverse_band
 
 Array = NDArray[Any]
 
@@ -49,6 +50,14 @@ class Factor(ABC):
     @abstractmethod
     def inverse(self, i: Array, j: Array) -> Array:
         """Elements of the inverse at columns `i`, `j` of one shape, tied together by measurements or of the border."""
+
+    @abstractmethod
+    def diagonal(self) -> Array:
+        """Of the inverse."""
+
+    @abstractmethod
+    def trace(self, other: "System") -> float:
+        """Of the inverse times the `J^T J` of some of the same measurements."""
 
 
 class System(ABC):
@@ -144,7 +153,7 @@ class BandFactor(Factor):
         from scipy.linalg import lapack  # as long to import as the rest of the library
 
         n, m = len(system.band), len(system.corner)
-        self.n, self._lapack = n, lapack
+        self.n, self._lapack, self._fused = n, lapack, system.fused
         self.damped = system.band.copy()
         self.damped[:, 0] += damping[:n]
         self.chol = self.damped.T
@@ -176,51 +185,53 @@ class BandFactor(Factor):
         return np.concatenate([inner - self.inverse_border @ outer, outer])
 
     def inverse(self, i: Array, j: Array) -> Array:
-        """The band of the inverse of the band's factor [Takahashi 1973], corrected for the border."""
-        n, m = self.n, len(self.corner)
-        identity = np.eye(m)
-        corner = self._lapack.dpotrs(self.corner, identity, lower=1)[0] if m else identity
-        # Rows of [-A^-1 B; 1]: how all columns follow those of the border.
-        follow = np.concatenate([-self.inverse_border, identity]) if m else np.zeros((n, 0))
-        result = np.einsum("...a,ab,...b->...", follow[i], corner, follow[j])
+        """The band's own inverse, corrected for the border."""
+        n, follow = self.n, self._follow
+        result = np.einsum("...a,ab,...b->...", follow[i], self._inverse_corner, follow[j])
         inner = (i < n) & (j < n)
         result[inner] += self._band_inverse(i[inner], j[inner])
         return result
 
+    def trace(self, other: System) -> float:
+        assert isinstance(other, BandSystem)
+        n, corner, follow = self.n, self._inverse_corner, self._follow[: self.n]
+        carried = follow @ corner
+        total = 2.0 * float(np.einsum("nm,nm->", carried, other.border))
+        total += float(np.einsum("ab,ab->", corner, other.corner + np.tril(other.corner, -1).T))
+        for d in range(min(other.band.shape[1], n)):
+            inverse = np.einsum("na,na->n", carried[d:], follow[: n - d])
+            if d < self._inverse.shape[1]:
+                inverse += self._inverse[: n - d, d]
+            total += (1.0 if d == 0 else 2.0) * float(np.einsum("n,n->", inverse, other.band[: n - d, d]))
+        return total
+
+    def diagonal(self) -> Array:
+        """Of the inverse."""
+        outer = np.einsum("na,ab,nb->n", self._follow, self._inverse_corner, self._follow, optimize=True)
+        outer[: self.n] += self._inverse[:, 0]
+        return outer
+
     def _band_inverse(self, i: Array, j: Array) -> Array:
-        i, j = np.maximum(i, j), np.minimum(i, j)
-        diagonal, below = self._inverse_blocks
-        size = diagonal.shape[1]
-        here, there = i // size, j // size
-        if len(i) and int((here - there).max()) > 1:
+        first, apart = np.minimum(i, j), np.abs(i - j)
+        if len(apart) and int(apart.max()) >= self._inverse.shape[1]:
             raise ValueError("these columns are too far apart for elements of the inverse to be known")
-        same = here == there
-        first = np.minimum(there, len(below) - 1) if len(below) else there
-        apart = below[first, i % size, j % size] if len(below) else np.zeros(len(i))
-        return np.where(same, diagonal[here, i % size, j % size], apart)
+        return self._inverse[first, apart]
 
     @cached_property
-    def _inverse_blocks(self) -> tuple[Array, Array]:
-        """The inverse's blocks on the diagonal and below it, as wide as the band."""
-        width, n = self.chol.shape
-        size = max(width - 1, 1)
-        count = -(-n // size)
-        # The factor in blocks: with a band as wide as a block there is one on the diagonal and one below it.
-        dense = np.zeros((count, 2 * size, size))
-        column, down = np.meshgrid(np.arange(n), np.arange(width), indexing="ij")
-        block, at = column // size, column % size
-        keep = column + down < n
-        dense[block[keep], (at + down)[keep], at[keep]] = self.chol.T[column[keep], down[keep]]
-        dense[-1, np.arange(size), np.arange(size)] += np.arange(size) >= n - (count - 1) * size
-        diagonal, below = np.empty((count, size, size)), np.empty((max(count - 1, 0), size, size))
-        for b in reversed(range(count)):
-            inverse = np.linalg.inv(dense[b, :size])
-            diagonal[b] = inverse.T @ inverse
-            if b < count - 1:
-                carried = dense[b, size:] @ inverse
-                below[b] = -diagonal[b + 1] @ carried
-                diagonal[b] += carried.T @ diagonal[b + 1] @ carried
-        return diagonal, below
+    def _inverse(self) -> Array:
+        """`[j, d]`: element `(j + d, j)` of the inverse of the band alone."""
+        return inverse_band(self._fused, self.chol.T)
+
+    @cached_property
+    def _inverse_corner(self) -> Array:
+        """The border's part of the inverse."""
+        identity = np.eye(len(self.corner))
+        return self._lapack.dpotrs(self.corner, identity, lower=1)[0] if len(identity) else identity
+
+    @cached_property
+    def _follow(self) -> Array:
+        """Rows of [-A^-1 B; 1]: how all columns follow those of the border."""
+        return np.concatenate([-self.inverse_border, np.eye(len(self.corner))])
 
 
 def _inner(a: Array, b: Array) -> Array:
@@ -308,3 +319,12 @@ class SparseFactor(Factor):
         unit = np.zeros((self._lu.shape[0], len(needed)))
         unit[needed, np.arange(len(needed))] = 1.0
         return self._lu.solve(unit)[i, which.reshape(j.shape)]
+
+    def diagonal(self) -> Array:
+        columns = np.arange(self._lu.shape[0])
+        return self.inverse(columns, columns)
+
+    def trace(self, other: System) -> float:
+        assert isinstance(other, SparseSystem)
+        matrix = other.matrix().tocoo()
+        return float(self.inverse(matrix.row, matrix.col) @ matrix.data)

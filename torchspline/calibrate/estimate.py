@@ -1,0 +1,366 @@
+"""Calibration of cameras and IMUs by least squares over a continuous trajectory, [S20] 6.2."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import torch
+from torch import Tensor
+
+from torchspline import checks
+from torchspline.calibrate.problem import (
+    CHOICES,
+    GROUPS,
+    CameraUnknowns,
+    ImuUnknowns,
+    Layout,
+    Options,
+    build,
+)
+from torchspline.calibrate.recording import Recording
+from torchspline.calibrate.start import Start, find_start
+from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
+from torchspline.fit.losses import Huber, Loss
+from torchspline.fit.residual import Residual
+from torchspline.fit.result import OpenDirection, Result
+from torchspline.fit.variables import Variable
+from torchspline.groups import SE3
+from torchspline.splines.bspline import BSpline
+
+#: The first solution, whose residuals say how noisy sensors are, need not be exact.
+_ROUGH = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class SensorResiduals:
+    """Of one sensor at the solution.
+
+    Attributes:
+        name: of the sensor, such as "cam0" or "imu0 gyroscope". unit: "px", "rad/s" or "m/s^2".
+        values: (N, R), predicted minus measured, in the order of the recording, of the rows `used`.
+        used: which corners or readings of the recording took part, bool.
+        sigma: standard deviation of a number that the solution was weighted with, in `unit`.
+        stated: what it was said to be beforehand.
+    """
+
+    name: str
+    unit: str
+    values: Tensor
+    used: Tensor
+    sigma: float
+    stated: float
+
+    @property
+    def rms(self) -> Tensor:
+        """(R,) root mean square of each axis."""
+        return self.values.square().mean(0).sqrt()
+
+    @property
+    def mean(self) -> Tensor:
+        """(R,)."""
+        return self.values.mean(0)
+
+    @property
+    def median_length(self) -> float:
+        """Median length of a residual: of pixels, the median reprojection error."""
+        return float(self.values.norm(dim=1).median())
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedCamera:
+    """Of one camera. Names ending in `_sigma` are standard deviations; None where something was not estimated.
+
+    Attributes:
+        T_imu_cam: (7,) SE3, maps points of the camera into the frame of the first IMU. Its deviations (6,) are of a
+            body tangent, in the frame of the camera: m, then rad.
+        time_offset: s, `t_imu = t_cam + time_offset`, with the clock of the first IMU.
+        intrinsics: (8,) fu, fv, pu, pv and the coefficients of the distortion.
+        line_delay: s from one line to the next below it; stamps are then those of the middle line.
+        images: (F,) bool, which images took part.
+    """
+
+    name: str
+    T_imu_cam: Tensor
+    T_imu_cam_sigma: Tensor
+    time_offset: float
+    time_offset_sigma: float | None
+    intrinsics: Tensor
+    intrinsics_sigma: Tensor | None
+    line_delay: float | None
+    line_delay_sigma: float | None
+    images: Tensor
+    residuals: SensorResiduals
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedImu:
+    """Of one IMU. Names ending in `_sigma` are standard deviations; None where something was not estimated.
+
+    Attributes:
+        gyro_bias, accel_bias: (3,), or (M, 3) control points of a spline of order 4 (`gyro_bias_spline`, ...).
+        T_imu0_imu: (7,) SE3, maps its points into the frame of the first IMU. Its deviations (6,) are of the position in
+            the first IMU, m, and of a body tangent of the rotation, rad.
+        time_offset: s, `t_imu_i = t_imu0 + time_offset`.
+        gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of the first accelerometer is lower triangular.
+    """
+
+    name: str
+    gyro_bias: Tensor
+    gyro_bias_sigma: Tensor
+    accel_bias: Tensor
+    accel_bias_sigma: Tensor
+    gyroscope: SensorResiduals
+    accelerometer: SensorResiduals
+    T_imu0_imu: Tensor
+    T_imu0_imu_sigma: Tensor | None = None
+    time_offset: float = 0.0
+    time_offset_sigma: float | None = None
+    gyro_scaling: Tensor | None = None
+    gyro_scaling_sigma: Tensor | None = None
+    accel_scaling: Tensor | None = None
+    accel_scaling_sigma: Tensor | None = None
+    gyro_bias_spline: BSpline | None = None
+    accel_bias_spline: BSpline | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What `calibrate` found.
+
+    Attributes:
+        cameras, imus: in the order of the recording.
+        gravity: (3,) acceleration in the frame of the board, m/s^2. gravity_sigma: (2,) of its direction, rad.
+        trajectory: of the first IMU in the frame of the board, by int64 nanoseconds of that IMU's clock.
+        result: of the solver: cost, iterations, covariances, `observability`.
+        recording, start: what it was made from.
+        seconds: wall time by phase: start, build, solve, weights, report, and the total.
+        notes: what a careful user wants to know, in words.
+    """
+
+    cameras: tuple[CalibratedCamera, ...]
+    imus: tuple[CalibratedImu, ...]
+    gravity: Tensor
+    gravity_sigma: Tensor
+    trajectory: BSpline
+    result: Result
+    recording: Recording
+    start: Start
+    seconds: dict[str, float]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def observability(self) -> list[OpenDirection]:
+        """Combinations of unknowns that the recording leaves open; empty is good."""
+        return self.result.observability
+
+    def T_cam_cam(self, to: int, of: int) -> Tensor:
+        """(7,) SE3: maps points of camera `of` into the frame of camera `to`."""
+        a, b = (self.cameras[i].T_imu_cam for i in (to, of))
+        return SE3.compose(SE3.inverse(a), b)
+
+
+def calibrate(
+    recording: Recording,
+    start: Start | None = None,
+    *,
+    order: int = 5,
+    spacing: float = 0.01,
+    representation: str = "split",
+    estimate: Collection[str] = ("time_offset",),
+    bias_spacing: float | None = None,
+    pixel_sigma: float = 0.5,
+    loss: Loss | None = Huber(3.0),
+    imu_loss: Loss | None = None,
+    reweigh: bool = True,
+    max_iterations: int = 50,
+    cost_tolerance: float = 1e-9,
+    progress: bool = False,
+) -> Calibration:
+    """Extrinsics of cameras, gravity, biases and clocks, with the trajectory, from one recording.
+
+    Minimises [S20] (71): reprojection errors (67) of the corners of a board that stands still, gyroscope (69) and
+    accelerometer (70) residuals, on one B-spline of the motion of the first IMU. All corners of an image count as one
+    measurement of its pose, see `ImageBlock`. Cost is linear in the length of the recording.
+
+    Args:
+        start: where to begin; by default `find_start(recording)`.
+        order, spacing [s]: of the trajectory's spline. Knots farther apart smooth what IMU readings say of fast motion.
+        representation: "split" (R3 x SO3) or "joint" (SE3); results are the same.
+        estimate: besides trajectory, extrinsics, gravity and biases: "time_offset" of every camera, "intrinsics" of
+            every camera, "line_delay" of rolling shutters (slower: corners of an image are no block then),
+            "imu_scaling": scale and misalignment of the axes.
+        bias_spacing: knot spacing [s] of biases that change over time as splines of order 4; None for constant ones.
+        pixel_sigma: standard deviation of a coordinate of a corner, px.
+        loss: of every corner, in standard deviations. imu_loss: of every reading of a gyroscope or accelerometer; a
+            robust one makes the solution slower to converge where the motion is rougher than the spline.
+        reweigh: replace the standard deviations of corners, gyroscopes and accelerometers by what their residuals say
+            after a first solution, one factor a sensor, so that those of the results are realistic: densities of data
+            sheets know nothing of vibration, splines that are too smooth, or boards that are not flat. Errors that are
+            alike over many images still make results worse than their deviations say. With False, what was stated.
+        max_iterations, cost_tolerance: of the solver, see `fit.Problem.solve`.
+        progress: show a progress bar on a terminal.
+    Returns:
+        Calibration.
+    Raises:
+        TypeError, ValueError: a wrong type or value; sensors that share no time; gaps in the IMU's readings; unknowns
+        that the recording does not determine (the message says which).
+    """
+    begin = perf_counter()
+    checks.instance("recording", recording, Recording, "a torchspline.calibrate.Recording")
+    options = _checked(
+        order, spacing, representation, estimate, bias_spacing, pixel_sigma, loss, imu_loss
+    )
+    if not isinstance(reweigh, bool):
+        raise TypeError(f"reweigh: expected True or False, got {type(reweigh).__name__}")
+    if not recording.imus:
+        raise ValueError("recording: expected at least one IMU, got none")
+    seconds = {}
+    if start is None:
+        start = find_start(recording)
+    else:
+        _check_start(start, recording)
+    seconds["start"] = perf_counter() - begin
+    now = perf_counter()
+    layout = build(recording, start, options)
+    seconds["build"] = perf_counter() - now
+    stated = {residual.name: sigma_of(residual) for residual in layout.residuals}
+    now, seconds["weights"] = perf_counter(), 0.0
+    how = {"max_iterations": max_iterations, "progress": progress}
+    if reweigh:
+        first = layout.problem.solve(cost_tolerance=max(_ROUGH, cost_tolerance), **how)
+        before = perf_counter()
+        for name, factor in noise_factors(first, layout.residuals).items():
+            rescale(next(x for x in layout.residuals if x.name == name), factor)
+        seconds["weights"] = perf_counter() - before
+    result = layout.problem.solve(cost_tolerance=cost_tolerance, **how)
+    seconds["solve"] = perf_counter() - now - seconds["weights"]
+    now = perf_counter()
+    cameras = tuple(_camera(recording, layout, i, result, stated) for i in range(len(recording.cameras)))
+    imus = tuple(_imu(layout, i, result, stated) for i in range(len(recording.imus)))
+    gravity_sigma = result.standard_deviation(layout.gravity)
+    seconds["report"] = perf_counter() - now
+    seconds["total"] = perf_counter() - begin
+    return Calibration(
+        cameras, imus, layout.gravity.value, gravity_sigma, layout.trajectory, result, recording, start,
+        seconds, _notes(result, start),
+    )  # fmt: skip
+
+
+def _checked(
+    order: int,
+    spacing: float,
+    representation: str,
+    estimate: Collection[str],
+    bias_spacing: float | None,
+    pixel_sigma: float,
+    loss: Loss | None,
+    imu_loss: Loss | None,
+) -> Options:
+    checks.whole("order", order, least=4)
+    checks.positive("spacing", spacing)
+    checks.choice("representation", representation, tuple(GROUPS))
+    if isinstance(estimate, str) or not isinstance(estimate, Collection):
+        raise TypeError(f"estimate: expected a set of names such as {{'time_offset'}}, got {estimate!r}")
+    for name in estimate:
+        checks.choice("estimate", name, CHOICES)
+    if bias_spacing is not None:
+        checks.positive("bias_spacing", bias_spacing)
+    checks.positive("pixel_sigma", pixel_sigma)
+    for name, x in (("loss", loss), ("imu_loss", imu_loss)):
+        if x is not None:
+            checks.instance(name, x, Loss, "a robust loss such as torchspline.fit.Huber(3.0)")
+    return Options(
+        order, spacing, representation, frozenset(estimate), bias_spacing, pixel_sigma, loss, imu_loss
+    )
+
+
+def _check_start(start: Start, recording: Recording) -> None:
+    checks.instance("start", start, Start, "a torchspline.calibrate.Start")
+    for name, x, count in (
+        ("T_imu_cam", start.T_imu_cam, len(recording.cameras)),
+        ("T_imu0_imu", start.T_imu0_imu, len(recording.imus)),
+    ):
+        if len(x) != count:
+            raise ValueError(f"start: expected {count} rows of {name}, one a sensor of the recording, got {len(x)}")
+
+
+# ---------------------------------------------------------------------- what was found
+
+
+def _sigma(result: Result, variable: Variable | None, estimated: bool = True) -> Tensor | None:
+    return result.standard_deviation(variable) if variable is not None and estimated else None
+
+
+def _number(x: Tensor | None) -> float | None:
+    return None if x is None else float(x)
+
+
+def _residuals(
+    residual: Residual, name: str, unit: str, used: Tensor, result: Result, stated: dict[str, float]
+) -> SensorResiduals:
+    return SensorResiduals(
+        name, unit, result.residuals[residual.name], used, sigma_of(residual), stated[residual.name]
+    )
+
+
+def _camera(
+    recording: Recording, layout: Layout, i: int, result: Result, stated: dict[str, float]
+) -> CalibratedCamera:
+    unknowns: CameraUnknowns = layout.cameras[i]
+    frozen = [not result.is_estimated(x) for x in (unknowns.ahead, unknowns.intrinsics)]
+    delay = unknowns.line_delay
+    return CalibratedCamera(
+        name=recording.cameras[i].name,
+        T_imu_cam=unknowns.extrinsics.value,
+        T_imu_cam_sigma=result.standard_deviation(unknowns.extrinsics),
+        time_offset=-float(unknowns.ahead.value),
+        time_offset_sigma=_number(_sigma(result, unknowns.ahead, not frozen[0])),
+        intrinsics=unknowns.intrinsics.value,
+        intrinsics_sigma=_sigma(result, unknowns.intrinsics, not frozen[1]),
+        line_delay=None if delay is None else float(delay.value),
+        line_delay_sigma=_number(_sigma(result, delay)),
+        images=unknowns.images,
+        residuals=_residuals(
+            unknowns.residual, recording.cameras[i].name, "px", unknowns.corners, result, stated
+        ),
+    )
+
+
+def _imu(layout: Layout, i: int, result: Result, stated: dict[str, float]) -> CalibratedImu:
+    unknowns: ImuUnknowns = layout.imus[i]
+    name, found = f"imu{i}", {}
+    for kind, x in (("gyro_bias", unknowns.gyro_bias), ("accel_bias", unknowns.accel_bias)):
+        if isinstance(x, Variable):
+            found[kind], found[f"{kind}_sigma"] = x.value, result.standard_deviation(x)
+        else:
+            found[kind], found[f"{kind}_sigma"] = x.control_points.detach(), result.point_deviation(x)
+            found[f"{kind}_spline"] = x
+    for kind, y in (("gyro_scaling", unknowns.gyro_scaling), ("accel_scaling", unknowns.accel_scaling)):
+        if y is not None:
+            found[kind] = y.value.reshape(3, 3)
+            found[f"{kind}_sigma"] = result.standard_deviation(y).reshape(3, 3)
+    T = SE3.identity(dtype=torch.float64)
+    if unknowns.rotation is not None and unknowns.lever_arm is not None and unknowns.ahead is not None:
+        T = torch.cat([unknowns.lever_arm.value, unknowns.rotation.value])
+        found["T_imu0_imu_sigma"] = torch.cat(
+            [result.standard_deviation(unknowns.lever_arm), result.standard_deviation(unknowns.rotation)]
+        )
+        found["time_offset"] = float(unknowns.ahead.value)
+        found["time_offset_sigma"] = float(result.standard_deviation(unknowns.ahead))
+    sensors = [
+        _residuals(residual, f"{name} {what}", unit, unknowns.samples, result, stated)
+        for residual, what, unit in (
+            (unknowns.gyroscope, "gyroscope", "rad/s"),
+            (unknowns.accelerometer, "accelerometer", "m/s^2"),
+        )
+    ]
+    return CalibratedImu(name=name, gyroscope=sensors[0], accelerometer=sensors[1], T_imu0_imu=T, **found)
+
+
+def _notes(result: Result, start: Start) -> list[str]:
+    notes = list(start.notes)
+    if not result.converged:
+        notes.append(f"the solution did not converge: {result.reason}; try more iterations or a larger spacing")
+    if result.outside:
+        notes.append(f"{result.outside} images or readings lie outside the trajectory and had no weight")
+    return notes
