@@ -3,6 +3,7 @@
 from torchspline.calibrate.board import BoardPoses, board_poses
 from torchspline.calibrate.reading import read_corners, read_recording
 from torchspline.calibrate.recording import Corners, ImuNoise, Recording
+from torchspline.calibrate.results import write_calibration
 from torchspline.calibrate.start import Start, find_start
 from torchspline.io.camera import Camera
 
@@ -17,4 +18,5 @@ __all__ = [
     "find_start",
     "read_corners",
     "read_recording",
+    "write_calibration",
 ]
