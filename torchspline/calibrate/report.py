@@ -109,7 +109,7 @@ def _remarks(calibration: Calibration, found: Coverage) -> str:
 def _camera_table(camera: CalibratedCamera, i: int) -> str:
     rotation = SO3.log(camera.T_imu_cam[3:])
     sigma = camera.T_imu_cam_sigma
-    rows = [
+    rows: list[tuple[str, float | None, float | None]] = [
         (f"T_imu_cam{i} position {a} [m]", x, None)
         for a, x in zip(_AXES, camera.T_imu_cam[:3].tolist(), strict=True)
     ]
@@ -230,10 +230,10 @@ def _provenance(calibration: Calibration) -> str:
     import platform
 
     recording = calibration.recording
-    sources = [x.source for x in (*recording.corners, *recording.imus) if x.source]
+    sources = [x.source for x in recording.corners] + [x.source for x in recording.imus]
     phases = ", ".join(f"{name} {value:.2f} s" for name, value in calibration.seconds.items())
     return (
-        f"From {', '.join(sources) or 'memory'}. {phases}. PyTorch {torch.__version__}, "
+        f"From {', '.join(filter(None, sources)) or 'memory'}. {phases}. PyTorch {torch.__version__}, "
         f"Python {platform.python_version()}."
     )
 
