@@ -2,7 +2,9 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,8 +13,6 @@ from torchspline import checks
 from torchspline.calibrate.problem import (
     CHOICES,
     GROUPS,
-    CameraUnknowns,
-    ImuUnknowns,
     Layout,
     Options,
     build,
@@ -29,6 +29,7 @@ from torchspline.splines.bspline import BSpline
 
 #: The first solution, whose residuals say how noisy sensors are, need not be exact.
 _ROUGH = 1e-5
+_LOSS = Huber(3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +99,8 @@ class CalibratedImu:
 
     Attributes:
         gyro_bias, accel_bias: (3,), or (M, 3) control points of a spline of order 4 (`gyro_bias_spline`, ...).
-        T_imu0_imu: (7,) SE3, maps its points into the frame of the first IMU. Its deviations (6,) are of the position in
-            the first IMU, m, and of a body tangent of the rotation, rad.
+        T_imu0_imu: (7,) SE3, maps its points into the frame of the first IMU. Its deviations (6,) are of the position
+            in the first IMU, m, and of a body tangent of the rotation, rad.
         time_offset: s, `t_imu_i = t_imu0 + time_offset`.
         gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of the first accelerometer is lower triangular.
     """
@@ -169,9 +170,10 @@ def calibrate(
     estimate: Collection[str] = ("time_offset",),
     bias_spacing: float | None = None,
     pixel_sigma: float = 0.5,
-    loss: Loss | None = Huber(3.0),
+    loss: Loss | None = _LOSS,
     imu_loss: Loss | None = None,
     reweigh: bool = True,
+    stretch: float | None = 2.0,
     max_iterations: int = 50,
     cost_tolerance: float = 1e-9,
     progress: bool = False,
@@ -195,8 +197,11 @@ def calibrate(
             robust one makes the solution slower to converge where the motion is rougher than the spline.
         reweigh: replace the standard deviations of corners, gyroscopes and accelerometers by what their residuals say
             after a first solution, one factor a sensor, so that those of the results are realistic: densities of data
-            sheets know nothing of vibration, splines that are too smooth, or boards that are not flat. Errors that are
-            alike over many images still make results worse than their deviations say. With False, what was stated.
+            sheets know nothing of vibration, splines that are too smooth, or boards that are not flat. With False,
+            what was stated.
+        stretch: s. Standard deviations hold when errors are alike over stretches of this length, see
+            `Result.standard_deviation`: biases that wander, a distortion that is not quite the lens's, corners that are
+            all seen too far inside. On real recordings those are ten times what independent errors (None) would give.
         max_iterations, cost_tolerance: of the solver, see `fit.Problem.solve`.
         progress: show a progress bar on a terminal.
     Returns:
@@ -207,11 +212,11 @@ def calibrate(
     """
     begin = perf_counter()
     checks.instance("recording", recording, Recording, "a torchspline.calibrate.Recording")
-    options = _checked(
-        order, spacing, representation, estimate, bias_spacing, pixel_sigma, loss, imu_loss
-    )
+    options = _checked(order, spacing, representation, estimate, bias_spacing, pixel_sigma, loss, imu_loss)
     if not isinstance(reweigh, bool):
         raise TypeError(f"reweigh: expected True or False, got {type(reweigh).__name__}")
+    if stretch is not None:
+        checks.positive("stretch", stretch)
     if not recording.imus:
         raise ValueError("recording: expected at least one IMU, got none")
     seconds = {}
@@ -225,19 +230,21 @@ def calibrate(
     seconds["build"] = perf_counter() - now
     stated = {residual.name: sigma_of(residual) for residual in layout.residuals}
     now, seconds["weights"] = perf_counter(), 0.0
-    how = {"max_iterations": max_iterations, "progress": progress}
+    solve = partial(layout.problem.solve, max_iterations=max_iterations, progress=progress)
     if reweigh:
-        first = layout.problem.solve(cost_tolerance=max(_ROUGH, cost_tolerance), **how)
+        first = solve(cost_tolerance=max(_ROUGH, cost_tolerance))
         before = perf_counter()
         for name, factor in noise_factors(first, layout.residuals).items():
             rescale(next(x for x in layout.residuals if x.name == name), factor)
         seconds["weights"] = perf_counter() - before
-    result = layout.problem.solve(cost_tolerance=cost_tolerance, **how)
+    result = solve(cost_tolerance=cost_tolerance)
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
-    cameras = tuple(_camera(recording, layout, i, result, stated) for i in range(len(recording.cameras)))
-    imus = tuple(_imu(layout, i, result, stated) for i in range(len(recording.imus)))
-    gravity_sigma = result.standard_deviation(layout.gravity)
+    found = _Found(layout, result, stretch, stated)
+    cameras = tuple(_camera(recording, found, i) for i in range(len(recording.cameras)))
+    imus = tuple(_imu(found, i) for i in range(len(recording.imus)))
+    # Steps of a direction on the sphere are angles.
+    gravity_sigma = found.sigma(layout.gravity)
     seconds["report"] = perf_counter() - now
     seconds["total"] = perf_counter() - begin
     return Calibration(
@@ -281,86 +288,93 @@ def _check_start(start: Start, recording: Recording) -> None:
         ("T_imu0_imu", start.T_imu0_imu, len(recording.imus)),
     ):
         if len(x) != count:
-            raise ValueError(f"start: expected {count} rows of {name}, one a sensor of the recording, got {len(x)}")
+            raise ValueError(
+                f"start: expected {count} rows of {name}, one a sensor of the recording, got {len(x)}"
+            )
 
 
 # ---------------------------------------------------------------------- what was found
 
 
-def _sigma(result: Result, variable: Variable | None, estimated: bool = True) -> Tensor | None:
-    return result.standard_deviation(variable) if variable is not None and estimated else None
+class _Found(NamedTuple):
+    """What the estimates are made of."""
+
+    layout: Layout
+    result: Result
+    stretch: float | None
+    stated: dict[str, float]
+
+    def sigma(self, variable: Variable) -> Tensor:
+        return self.result.standard_deviation(variable, self.stretch)
+
+    def sigma_if(self, variable: Variable | None) -> Tensor | None:
+        """None if it was not estimated."""
+        return self.sigma(variable) if variable is not None and self.result.is_estimated(variable) else None
+
+    def residuals(self, residual: Residual, name: str, unit: str, used: Tensor) -> SensorResiduals:
+        values = self.result.residuals[residual.name]
+        return SensorResiduals(name, unit, values, used, sigma_of(residual), self.stated[residual.name])
 
 
 def _number(x: Tensor | None) -> float | None:
     return None if x is None else float(x)
 
 
-def _residuals(
-    residual: Residual, name: str, unit: str, used: Tensor, result: Result, stated: dict[str, float]
-) -> SensorResiduals:
-    return SensorResiduals(
-        name, unit, result.residuals[residual.name], used, sigma_of(residual), stated[residual.name]
-    )
-
-
-def _camera(
-    recording: Recording, layout: Layout, i: int, result: Result, stated: dict[str, float]
-) -> CalibratedCamera:
-    unknowns: CameraUnknowns = layout.cameras[i]
-    frozen = [not result.is_estimated(x) for x in (unknowns.ahead, unknowns.intrinsics)]
+def _camera(recording: Recording, found: _Found, i: int) -> CalibratedCamera:
+    unknowns, name = found.layout.cameras[i], recording.cameras[i].name
     delay = unknowns.line_delay
     return CalibratedCamera(
-        name=recording.cameras[i].name,
+        name=name,
         T_imu_cam=unknowns.extrinsics.value,
-        T_imu_cam_sigma=result.standard_deviation(unknowns.extrinsics),
+        T_imu_cam_sigma=found.sigma(unknowns.extrinsics),
         time_offset=-float(unknowns.ahead.value),
-        time_offset_sigma=_number(_sigma(result, unknowns.ahead, not frozen[0])),
+        time_offset_sigma=_number(found.sigma_if(unknowns.ahead)),
         intrinsics=unknowns.intrinsics.value,
-        intrinsics_sigma=_sigma(result, unknowns.intrinsics, not frozen[1]),
+        intrinsics_sigma=found.sigma_if(unknowns.intrinsics),
         line_delay=None if delay is None else float(delay.value),
-        line_delay_sigma=_number(_sigma(result, delay)),
+        line_delay_sigma=_number(found.sigma_if(delay)),
         images=unknowns.images,
-        residuals=_residuals(
-            unknowns.residual, recording.cameras[i].name, "px", unknowns.corners, result, stated
-        ),
+        residuals=found.residuals(unknowns.residual, name, "px", unknowns.corners),
     )
 
 
-def _imu(layout: Layout, i: int, result: Result, stated: dict[str, float]) -> CalibratedImu:
-    unknowns: ImuUnknowns = layout.imus[i]
-    name, found = f"imu{i}", {}
+def _imu(found: _Found, i: int) -> CalibratedImu:
+    unknowns, name = found.layout.imus[i], f"imu{i}"
+    fields: dict[str, Any] = {}
     for kind, x in (("gyro_bias", unknowns.gyro_bias), ("accel_bias", unknowns.accel_bias)):
         if isinstance(x, Variable):
-            found[kind], found[f"{kind}_sigma"] = x.value, result.standard_deviation(x)
+            fields |= {kind: x.value, f"{kind}_sigma": found.sigma(x)}
         else:
-            found[kind], found[f"{kind}_sigma"] = x.control_points.detach(), result.point_deviation(x)
-            found[f"{kind}_spline"] = x
+            fields |= {kind: x.control_points.detach(), f"{kind}_sigma": found.result.point_deviation(x)}
+            fields[f"{kind}_spline"] = x
     for kind, y in (("gyro_scaling", unknowns.gyro_scaling), ("accel_scaling", unknowns.accel_scaling)):
         if y is not None:
-            found[kind] = y.value.reshape(3, 3)
-            found[f"{kind}_sigma"] = result.standard_deviation(y).reshape(3, 3)
+            fields |= {kind: y.value.reshape(3, 3), f"{kind}_sigma": found.sigma(y).reshape(3, 3)}
     T = SE3.identity(dtype=torch.float64)
     if unknowns.rotation is not None and unknowns.lever_arm is not None and unknowns.ahead is not None:
         T = torch.cat([unknowns.lever_arm.value, unknowns.rotation.value])
-        found["T_imu0_imu_sigma"] = torch.cat(
-            [result.standard_deviation(unknowns.lever_arm), result.standard_deviation(unknowns.rotation)]
-        )
-        found["time_offset"] = float(unknowns.ahead.value)
-        found["time_offset_sigma"] = float(result.standard_deviation(unknowns.ahead))
-    sensors = [
-        _residuals(residual, f"{name} {what}", unit, unknowns.samples, result, stated)
+        sigmas = found.sigma(unknowns.lever_arm), found.sigma(unknowns.rotation)
+        fields |= {
+            "T_imu0_imu_sigma": torch.cat(sigmas),
+            "time_offset": float(unknowns.ahead.value),
+            "time_offset_sigma": float(found.sigma(unknowns.ahead)),
+        }
+    gyroscope, accelerometer = (
+        found.residuals(residual, f"{name} {what}", unit, unknowns.samples)
         for residual, what, unit in (
             (unknowns.gyroscope, "gyroscope", "rad/s"),
             (unknowns.accelerometer, "accelerometer", "m/s^2"),
         )
-    ]
-    return CalibratedImu(name=name, gyroscope=sensors[0], accelerometer=sensors[1], T_imu0_imu=T, **found)
+    )
+    return CalibratedImu(name=name, gyroscope=gyroscope, accelerometer=accelerometer, T_imu0_imu=T, **fields)
 
 
 def _notes(result: Result, start: Start) -> list[str]:
     notes = list(start.notes)
     if not result.converged:
-        notes.append(f"the solution did not converge: {result.reason}; try more iterations or a larger spacing")
+        notes.append(
+            f"the solution did not converge: {result.reason}; try more iterations or a larger spacing"
+        )
     if result.outside:
         notes.append(f"{result.outside} images or readings lie outside the trajectory and had no weight")
     return notes

@@ -7,8 +7,9 @@ fourteen) rows, goes on to the control points, the extrinsics and the clock.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -47,7 +48,8 @@ _CHUNK = 4096
 _POSE, _INTRINSICS = 6, 8
 
 
-class _ImageKernel(NamedTuple):
+@dataclass
+class _ImageKernel:
     """See `fit.terms.Kernel`."""
 
     order: list[str]
@@ -131,7 +133,10 @@ class _ImageTerm(Term):
         images, rows_of = len(value), self.kernel.rows
         blocks, costs = np.empty((images, rows_of, rows_of + 1)), np.empty(images)
         inside = ~places.outside[part]
-        shifted = (np.concatenate([np.zeros((offset, 7)), numbers[0]]) if offset else numbers[0], *numbers[1:])
+        shifted = (
+            np.concatenate([np.zeros((offset, 7)), numbers[0]]) if offset else numbers[0],
+            *numbers[1:],
+        )
 
         def piece(begin: int, stop: int) -> None:
             a, b = self.first[offset + begin], self.first[offset + stop]
@@ -224,9 +229,8 @@ class ImageBlock(Residual):
                 "clock: corners of a block are seen at once; got a line delay: use ReprojectionRadtan or "
                 "ReprojectionEquidistant for a rolling shutter"
             )
-        super().__init__(
-            t, torch.empty(len(t), 0, dtype=torch.float64), loss=loss, clock=clock, name=name, **arguments
-        )
+        given: dict[str, Any] = {"loss": loss, "clock": clock, "name": name, **arguments}
+        super().__init__(t, torch.empty(len(t), 0, dtype=torch.float64), **given)
         count = _check_corners(image, uv, xyz, len(t))
         self.image, self.uv, self.xyz = (x.detach().cpu() for x in (image, uv.double(), xyz.double()))
         self.pixels, self.projection = checks.positive("sigma", sigma), PROJECTIONS[distortion]

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torchspline.calibrate.recording import Recording
 from torchspline.calibrate.start import Start
 from torchspline.fit.losses import Loss
 from torchspline.fit.problem import Problem
-from torchspline.fit.residual import Argument, Clock, Residual
+from torchspline.fit.residual import Clock, Residual
 from torchspline.fit.residuals import Accelerometer, Gyroscope
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, Group
@@ -88,7 +88,9 @@ class Layout:
     @property
     def residuals(self) -> list[Residual]:
         """Of all sensors."""
-        return [x for u in self.imus for x in (u.gyroscope, u.accelerometer)] + [u.residual for u in self.cameras]
+        return [x for u in self.imus for x in (u.gyroscope, u.accelerometer)] + [
+            u.residual for u in self.cameras
+        ]
 
 
 def build(recording: Recording, start: Start, options: Options) -> Layout:
@@ -98,9 +100,7 @@ def build(recording: Recording, start: Start, options: Options) -> Layout:
         ValueError: sensors that share no stretch of time, gaps in the readings of the IMU.
     """
     trajectory = _trajectory(recording, start, options)
-    gravity = Variable(
-        "gravity", start.gravity * (recording.gravity / start.gravity.norm()), sphere=True
-    )
+    gravity = Variable("gravity", start.gravity * (recording.gravity / start.gravity.norm()), sphere=True)
     layout = Layout(Problem(trajectory), trajectory, gravity)
     for i in range(len(recording.imus)):
         _add_imu(layout, recording, i, start, options)
@@ -146,10 +146,10 @@ def _trajectory(recording: Recording, start: Start, options: Options) -> BSpline
     t = (np.arange(count) - 0.5 * (options.order - 2)) * (dt / NS)
     known = (start.t_ns - first).numpy() / NS
     points = _through(known, start.T_board_imu.numpy(), np.clip(t, known[0], known[-1]))
+    group = Group(GROUPS[options.representation])
     return BSpline(
-        torch.from_numpy(points), group=Group(GROUPS[options.representation]), order=options.order, dt_ns=dt, t0_ns=first,
-        learnable=False,
-    )  # fmt: skip
+        torch.from_numpy(points), group=group, order=options.order, dt_ns=dt, t0_ns=first, learnable=False
+    )
 
 
 def _through(t: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -184,55 +184,63 @@ def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None
 # ---------------------------------------------------------------------- sensors
 
 
-def _add_imu(
-    layout: Layout, recording: Recording, i: int, start: Start, options: Options
-) -> None:
+def _add_imu(layout: Layout, recording: Recording, i: int, start: Start, options: Options) -> None:
     record, noise = recording.imus[i], recording.noise[i]
     first, last = layout.trajectory.domain
     shift = round(float(start.imu_time_offset[i]) * NS)
     inside = (record.time_ns - shift >= first) & (record.time_ns - shift <= last)
     part = record.window(int(first) + shift, int(last) + shift)
     if len(part) < 2:
-        raise ValueError(f"{record.source or f'imus[{i}]'}: expected readings while cameras saw the board, got none")
+        raise ValueError(
+            f"{record.source or f'imus[{i}]'}: expected readings while cameras saw the board, got none"
+        )
     rate = math.sqrt((len(part) - 1) * NS / int(part.time_ns[-1] - part.time_ns[0]))
-    own: dict[str, Variable] = {}
-    clock = None
+    mount: dict[str, Variable] = {}
+    clock = ahead = None
     if i > 0:
-        own["rotation"] = Variable(f"imu{i} rotation", start.T_imu0_imu[i, 3:], group=SO3)
-        own["lever_arm"] = Variable(f"imu{i} lever arm", start.T_imu0_imu[i, :3])
+        mount["rotation"] = Variable(f"imu{i} rotation", start.T_imu0_imu[i, 3:], group=SO3)
+        mount["lever_arm"] = Variable(f"imu{i} lever arm", start.T_imu0_imu[i, :3])
         # `t_imu_i = t_imu0 + offset`, as a `Clock` has it.
-        own["ahead"] = Variable(f"imu{i} ahead", start.imu_time_offset[i : i + 1])
-        clock = Clock(offset=own["ahead"])
+        ahead = Variable(f"imu{i} ahead", start.imu_time_offset[i : i + 1])
+        clock = Clock(offset=ahead)
     gyro_bias = _bias(f"imu{i} gyro bias", start.gyro_bias[i], layout.trajectory, options)
     accel_bias = _bias(f"imu{i} accel bias", start.accel_bias[i], layout.trajectory, options)
-    gyro_extra: dict[str, Argument] = {k: v for k, v in own.items() if k == "rotation"}
-    accel_extra: dict[str, Argument] = {k: v for k, v in own.items() if k != "ahead"}
+    scaling: dict[str, Variable] = {}
     if "imu_scaling" in options.estimate:
-        for name, extra in (("gyro", gyro_extra), ("accel", accel_extra)):
-            extra["scaling"] = Variable(f"imu{i} {name} scaling", torch.tensor(_UNIT, dtype=torch.float64))
+        for sensor in ("gyro", "accel"):
+            scaling[sensor] = Variable(f"imu{i} {sensor} scaling", torch.tensor(_UNIT, dtype=torch.float64))
     names = f"imu{i} gyroscope", f"imu{i} accelerometer"
-    gyroscope = Gyroscope(
-        part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate,
-        loss=options.imu_loss, clock=clock, name=names[0], bias=gyro_bias, **gyro_extra,
-    )  # fmt: skip
-    accelerometer = Accelerometer(
-        part.time_ns, part.accelerometer, sigma=noise.accel_density * rate,
-        loss=options.imu_loss, clock=clock, name=names[1], bias=accel_bias, gravity=layout.gravity, **accel_extra,
-    )  # fmt: skip
-    problem = layout.problem
-    problem.add(gyroscope)
-    problem.add(accelerometer)
-    found = ImuUnknowns(gyro_bias, accel_bias, gyroscope, accelerometer, inside)
+    shared: dict[str, Any] = {"loss": options.imu_loss, "clock": clock}
+    gyro_given: dict[str, Any] = {"bias": gyro_bias}
+    accel_given: dict[str, Any] = {"bias": accel_bias, "gravity": layout.gravity, **mount}
     if i > 0:
-        found.rotation, found.lever_arm, found.ahead = own["rotation"], own["lever_arm"], own["ahead"]
-    if "imu_scaling" in options.estimate:
-        found.gyro_scaling, found.accel_scaling = gyro_extra["scaling"], accel_extra["scaling"]
+        gyro_given["rotation"] = mount["rotation"]
+    if scaling:
+        gyro_given["scaling"], accel_given["scaling"] = scaling["gyro"], scaling["accel"]
+    gyroscope = Gyroscope(
+        part.time_ns, part.gyroscope, sigma=noise.gyro_density * rate, name=names[0], **shared, **gyro_given
+    )
+    accelerometer = Accelerometer(
+        part.time_ns,
+        part.accelerometer,
+        sigma=noise.accel_density * rate,
+        name=names[1],
+        **shared,
+        **accel_given,
+    )
+    layout.problem.add(gyroscope)
+    layout.problem.add(accelerometer)
+    if scaling and i == 0:
         # The frame of the IMU is that of its accelerometer: x along its first axis, y in the plane of the first two.
         sigma = torch.full((9,), _FREE, dtype=torch.float64)
         sigma[list(_ABOVE_DIAGONAL)] = _FIXED
-        if i == 0:
-            problem.add_prior(found.accel_scaling, sigma=sigma)
-    layout.imus.append(found)
+        layout.problem.add_prior(scaling["accel"], sigma=sigma)
+    layout.imus.append(
+        ImuUnknowns(
+            gyro_bias, accel_bias, gyroscope, accelerometer, inside, mount.get("rotation"), mount.get("lever_arm"),
+            ahead, scaling.get("gyro"), scaling.get("accel"),
+        )
+    )  # fmt: skip
 
 
 def _bias(name: str, value: Tensor, trajectory: BSpline, options: Options) -> Variable | BSpline:
@@ -246,9 +254,7 @@ def _bias(name: str, value: Tensor, trajectory: BSpline, options: Options) -> Va
     return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=int(first), learnable=False)
 
 
-def _add_camera(
-    layout: Layout, recording: Recording, i: int, start: Start, options: Options
-) -> None:
+def _add_camera(layout: Layout, recording: Recording, i: int, start: Start, options: Options) -> None:
     camera, corners, problem = recording.cameras[i], recording.corners[i], layout.problem
     number, name = f"cam{i}", f"cam{i} corners"
     offset = float(start.time_offset[i])
@@ -261,15 +267,13 @@ def _add_camera(
             f"{corners.source or camera.name}: expected corners while the IMU measured, got none there"
         )
     ahead = Variable(f"{number} ahead", torch.tensor([-offset], dtype=torch.float64))
-    extrinsics = Variable(
-        f"{number} extrinsics", SE3.normalize(start.T_imu_cam[i]), group=SE3
-    )
+    extrinsics = Variable(f"{number} extrinsics", SE3.normalize(start.T_imu_cam[i]), group=SE3)
     intrinsics = Variable(f"{number} intrinsics", camera.parameters)
     frame = (torch.cumsum(images, 0) - 1)[corners.frame[kept]]
     uv, xyz, stamps = corners.uv[kept], corners.xyz[kept], corners.t_ns[images]
     sigma = options.pixel_sigma
     delay = None
-    shared = {"intrinsics": intrinsics, "T_body_camera": extrinsics}
+    shared: dict[str, Any] = {"intrinsics": intrinsics, "T_body_camera": extrinsics}
     if "line_delay" in options.estimate:
         delay = Variable(f"{number} line delay", torch.zeros(1, dtype=torch.float64))
         middle = 0.5 * (camera.resolution[1] - 1)

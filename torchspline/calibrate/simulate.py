@@ -108,11 +108,11 @@ def simulate(
     )
     # Images keep away from the ends by more than the offsets, so that none of them leaves the trajectory.
     edge = 0.02 * _NS
-    times = start + (edge + torch.linspace(0, 1, images, dtype=torch.float64) * (span - 2 * edge)).round().long()
+    times = (
+        start + (edge + torch.linspace(0, 1, images, dtype=torch.float64) * (span - 2 * edge)).round().long()
+    )
     camera = [_camera(f"cam{i}", distortion) for i in range(cameras)]
-    seen = [
-        _sights(trajectory, times, T_imu_cam[i], float(offsets[i]), camera[i]) for i in range(cameras)
-    ]
+    seen = [_sights(trajectory, times, T_imu_cam[i], float(offsets[i]), camera[i]) for i in range(cameras)]
     keep = _chosen([len(x) for x in seen], corners, generator)
     seen = [_kept(x, k) for x, k in zip(seen, keep, strict=True)]
     seen = [replace(x, uv=noisy(x.uv, pixel_sigma)) for x in seen]
@@ -130,7 +130,7 @@ def _mounting(cameras: int) -> tuple[Tensor, Tensor]:
     poses = []
     for i in range(cameras):
         rotation = turn * Rotation.from_rotvec([0.002 * i, 0.01 * i, -0.004 * i])
-        position = turn.apply([0.11 * i, 0.0005 * i, -0.001 * i]) + [-0.0216, -0.0647, 0.0098]
+        position = turn.apply([0.11 * i, 0.0005 * i, -0.001 * i]) + np.array([-0.0216, -0.0647, 0.0098])
         poses.append([*position, *rotation.as_quat(scalar_first=True)])
     return torch.tensor(poses, dtype=torch.float64), torch.linspace(0.0041, 0.0046, cameras).double()
 
@@ -148,7 +148,7 @@ def _trajectory(
     waves = np.sin(2 * np.pi * t[:, None, None] / periods + phase)
     beats = np.sin(2 * np.pi * t[:, None, None] / (0.83 * periods[::-1]) + 2 * phase)
     middle = 0.5 * (_TAGS * _TAG + (_TAGS - 1) * _GAP)
-    position = (heights * waves).sum(-1) + [middle, middle, 0.75]
+    position = (heights * waves).sum(-1) + np.array([middle, middle, 0.75])
     # Looking down at the board: x to its right, y down, z away from whoever looks.
     facing = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     rotation = facing * Rotation.from_rotvec((turns * beats).sum(-1))

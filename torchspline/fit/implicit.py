@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchspline.fit.kernel import ResidualKernel
 from torchspline.fit.model import Model, State, seconds_of
 from torchspline.fit.residual import square_root_information
 from torchspline.fit.system import Factor, SingularError, System
@@ -36,6 +37,12 @@ def differentiable(linearizer: "Linearizer", state: State, system: System) -> Nu
     Raises:
         ValueError: nothing requires grad; the solution is not determined.
     """
+    for term in _terms(linearizer):
+        if not isinstance(term.kernel, ResidualKernel):
+            raise ValueError(
+                f"differentiable: {term.residual.name} sums up its measurements and has no automatic derivatives; "
+                "use the residual of a single measurement, such as ReprojectionRadtan"
+            )
     tensors = _inputs(linearizer)
     if not tensors:
         raise ValueError(

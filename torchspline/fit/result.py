@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit.model import State, Unknown
+from torchspline.fit.scatter import scatter
 from torchspline.fit.solver import Trace
 from torchspline.fit.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.terms import Term
@@ -60,6 +61,7 @@ class Result:
         if numbers is None:
             points = {key: torch.from_numpy(x).clone() for key, x in state.points.items()}
             numbers = points | {key: x.clone() for key, x in state.values.items()}
+        self._scatter: dict[float, Array] = {}
         #: The trajectory's control points, unit, and the variables' values by name; with a graph if so asked.
         self.control_points = numbers[id(model.trajectory.module)]
         self.values = {v.name: numbers[id(v)] for v in model.variables}
@@ -114,8 +116,9 @@ class Result:
     def redundancy(self) -> dict[str, float]:
         """How many of the numbers of each residual were left to check the solution, by name as in `residuals`.
 
-        The trace of `I - J (J^T W J)^-1 J^T W`: numbers measured minus those that unknowns went along with. The weighted
-        sum of squares of a residual over its redundancy is 1 if its standard deviation was right [Foerstner 1979].
+        The trace of `I - J (J^T W J)^-1 J^T W`: numbers measured minus those that unknowns went along with. The
+        weighted sum of squares of a residual over its redundancy is 1 if its standard deviation was right
+        [Foerstner 1979].
 
         Raises:
             ValueError: the measurements do not determine all unknowns.
@@ -178,9 +181,26 @@ class Result:
         blocks = torch.from_numpy(self._determined().inverse(i, j))
         return blocks[0] if variable.value.ndim == 1 else blocks
 
-    def standard_deviation(self, variable: Variable) -> Tensor:
-        """Square roots of the diagonal of `covariance`."""
-        return self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+    def standard_deviation(self, variable: Variable, stretch: float | None = None) -> Tensor:
+        """Square roots of the diagonal of `covariance`; with `stretch` also where errors are alike for a while.
+
+        Args:
+            stretch: s. Residuals may be correlated within stretches of the trajectory of this length, as they are where
+                a model is not exact or a bias wanders: the scatter of what stretches pull at counts then
+                (the cluster-robust covariance [Liang and Zeger 1986]), where it is larger. There are six at least.
+        Raises:
+            ValueError: as `covariance`; a stretch that is not above zero; too many variables for a band with a border.
+        """
+        own = self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+        if stretch is None:
+            return own
+        checks.positive("stretch", stretch)
+        if stretch not in self._scatter:
+            self._scatter[stretch] = scatter(self._linearizer, self._state, self._factor, stretch)
+        model = self._linearizer.model
+        columns = model.columns[id(variable)] - model.band
+        found = torch.from_numpy(np.sqrt(np.square(self._scatter[stretch][:, columns]).sum(axis=0)))
+        return torch.maximum(own, found.reshape(own.shape))
 
     def point_deviation(self, spline: BSpline) -> Tensor:
         """Standard deviations of the steps of a spline's control points, `(M, D)`; 0 for those that stayed.

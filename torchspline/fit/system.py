@@ -205,6 +205,10 @@ class BandFactor(Factor):
             total += (1.0 if d == 0 else 2.0) * float(np.einsum("n,n->", inverse, other.band[: n - d, d]))
         return total
 
+    def border_steps(self, columns: Array) -> Array:
+        """Rows `(..., m)` of the inverse at `columns`: how the border moves with a gradient there."""
+        return self._follow[columns] @ self._inverse_corner
+
     def diagonal(self) -> Array:
         """Of the inverse."""
         outer = np.einsum("na,ab,nb->n", self._follow, self._inverse_corner, self._follow, optimize=True)

@@ -106,9 +106,10 @@ def workspace(width, like):
 
 
 def to_points(local, bases, chain, order, size, moved, width):
-    """`moved` = T^T `local`, of the first `width` columns, T from control points to local coordinates: logarithm j moves with its two points.
+    """`moved` = T^T `local`, of the first `width` columns; T leads from control points to local coordinates.
 
-    Six rows are added at a time: the loop over columns is short, and starting it costs more than a few products.
+    Logarithm j moves with its two points. Six rows are added at a time: the loop over columns is short, and starting it
+    costs more than a few products.
     """
     for a in range(local.shape[0]):
         for b in range(width):
@@ -157,7 +158,9 @@ def to_band(rows, starts, bases, chain, order, size, columns, band, border, corn
     lines, lined, gram, moved = workspace(width, rows)
     n, reach, outside = band.shape[0], band.shape[1], 0
     for run in range(len(starts) - 1):
-        run_gram(rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved)
+        run_gram(
+            rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved
+        )
         for a in range(width - 1):
             i = columns[run, a]
             if i < 0:
@@ -184,7 +187,9 @@ def to_blocks(rows, starts, bases, chain, order, size, columns, blocks, right):
     width = rows.shape[2]
     lines, lined, gram, moved = workspace(width, rows)
     for run in range(len(starts) - 1):
-        run_gram(rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved)
+        run_gram(
+            rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved
+        )
         for a in range(width - 1):
             for b in range(width - 1):
                 blocks[run, a, b] = gram[a, b]

@@ -16,7 +16,7 @@ from torchspline.kernels.build import compiled
 from torchspline.kernels.rowwise import Array
 
 #: A pivot that is this small against its diagonal is rounding: the rows do not determine that combination.
-_LEAST_PIVOT = 1e-13
+LEAST_PIVOT = 1e-13
 
 
 def to_triangles(rows, starts, weight, begin, stop, out):
@@ -58,16 +58,14 @@ def to_triangles(rows, starts, weight, begin, stop, out):
                 triangle[a, b] = value * scale
 
 
-_SIGNATURE = (
-    "void(float64[:, :, ::1], int64[::1], float64[::1], int64, int64, float64[:, :, ::1])"
-)
+_SIGNATURE = "void(float64[:, :, ::1], int64[::1], float64[::1], int64, int64, float64[:, :, ::1])"
 
 
 @cache
 def _compiled() -> Callable:
     helper, loop = (inspect.getsource(f) for f in (outer_products, to_triangles))
     header = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", "0").replace("assemble.py", "gram.py")
-    header = header.rstrip() + f"\nLEAST_PIVOT = {_LEAST_PIVOT}\n\n"
+    header = header.rstrip() + f"\nLEAST_PIVOT = {LEAST_PIVOT}\n\n"
     return compiled("to_triangles", f"{header}\n{_HELPER}{helper}\n\n{_ENTRY}{loop}", _SIGNATURE)
 
 
@@ -90,6 +88,6 @@ def _reference(rows: Array, starts: Array, weight: Array, out: Array) -> None:
     for a in range(out.shape[1]):
         done = out[:, :a, a]
         pivot = gram[:, a, a] - np.square(done).sum(axis=1)
-        keep = pivot > _LEAST_PIVOT * gram[:, a, a]
+        keep = pivot > LEAST_PIVOT * gram[:, a, a]
         line = gram[:, a, a:] - np.einsum("nk,nkb->nb", done, out[:, :a, a:])
         out[keep, a, a:] = line[keep] / np.sqrt(pivot[keep])[:, None]
