@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import error_online  # noqa: F401  (its cases are made of all that is accepted before this module adds to it)
 import numpy as np
 import torch
 import yaml
@@ -168,7 +169,9 @@ def cases() -> Iterator[Case]:
     twice = [CORNER_FILE, CORNER_FILE]
     yield refused("read_recording", "corners", "count", twice, "got cam0", "cam0, cam1", named="config.yaml")
     bad = file("not an archive", "text.npz")
-    yield refused("read_corners", "path", "nan", bad, "damaged", "expected an npz archive", named="text.npz")
+    yield refused(
+        "read_corners", "path", "option", bad, "damaged", "expected an npz archive", named="text.npz"
+    )
 
 
 def _of_cameras() -> Iterator[Case]:
@@ -302,4 +305,30 @@ def _of_recordings() -> Iterator[Case]:
 
 
 CASES = list(cases())
-NOT_APPLICABLE: dict[str, dict[str, str]] = {}
+
+_FILES = "read_camchain write_camchain read_corners read_recording write_calibration"
+_CHECKED = "Recording board_poses find_start"
+_PARTS = "Recording.between Recording.only"
+#: Where a kind of mistake cannot be made, as in test_errors.py.
+NOT_APPLICABLE = {
+    "shape": {
+        "files, numbers and what was checked when it was made": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise",
+    },
+    "dtype": {"files, numbers and checked parts": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera"},
+    "device": {
+        "files, numbers and checked parts, which are on the CPU": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera",
+        "written number by number, wherever they are": "CamChain",
+    },
+    "nan": {
+        "files, whose numbers are tried in test_calibration_files.py": f"{_FILES}",
+        "no numbers that can be one": "Corners.select Recording.only board_poses",
+    },
+    "zero quaternion": {
+        "no quaternion in it": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera Corners Corners.select",
+    },
+    "count": {
+        "one of it": "Camera ImuNoise write_camchain write_calibration read_corners Recording.between",
+        "any number of images": "Corners.select board_poses",
+    },
+    "time": {"no times": f"{_FILES} Camera CamChain Corners.select ImuNoise Recording.only board_poses"},
+}
