@@ -22,7 +22,8 @@ from torchspline.calibrate.start import Start, find_start
 from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
 from torchspline.fit.losses import Huber, Loss
 from torchspline.fit.residual import Residual
-from torchspline.fit.result import OpenDirection, Result
+from torchspline.fit.result import OpenDirection, Result, control_point_deviation
+from torchspline.fit.solver import Options as Solver
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
 from torchspline.splines.bspline import BSpline
@@ -213,6 +214,7 @@ def calibrate(
     begin = perf_counter()
     checks.instance("recording", recording, Recording, "a torchspline.calibrate.Recording")
     options = _checked(order, spacing, representation, estimate, bias_spacing, pixel_sigma, loss, imu_loss)
+    Solver.checked(max_iterations, cost_tolerance, 0.0, 1.0)
     if not isinstance(reweigh, bool):
         raise TypeError(f"reweigh: expected True or False, got {type(reweigh).__name__}")
     if stretch is not None:
@@ -240,7 +242,7 @@ def calibrate(
     result = solve(cost_tolerance=cost_tolerance)
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
-    found = _Found(layout, result, stretch, stated)
+    found = _Found(layout, result, stretch, stated, layout.frozen)
     cameras = tuple(_camera(recording, found, i) for i in range(len(recording.cameras)))
     imus = tuple(_imu(found, i) for i in range(len(recording.imus)))
     # Steps of a direction on the sphere are angles.
@@ -303,13 +305,16 @@ class _Found(NamedTuple):
     result: Result
     stretch: float | None
     stated: dict[str, float]
+    frozen: list[Variable]
 
     def sigma(self, variable: Variable) -> Tensor:
         return self.result.standard_deviation(variable, self.stretch)
 
     def sigma_if(self, variable: Variable | None) -> Tensor | None:
         """None if it was not estimated."""
-        return self.sigma(variable) if variable is not None and self.result.is_estimated(variable) else None
+        if variable is None or variable in self.frozen:
+            return None
+        return self.sigma(variable)
 
     def residuals(self, residual: Residual, name: str, unit: str, used: Tensor) -> SensorResiduals:
         values = self.result.residuals[residual.name]
@@ -345,7 +350,10 @@ def _imu(found: _Found, i: int) -> CalibratedImu:
         if isinstance(x, Variable):
             fields |= {kind: x.value, f"{kind}_sigma": found.sigma(x)}
         else:
-            fields |= {kind: x.control_points.detach(), f"{kind}_sigma": found.result.point_deviation(x)}
+            fields |= {
+                kind: x.control_points.detach(),
+                f"{kind}_sigma": control_point_deviation(found.result, x),
+            }
             fields[f"{kind}_spline"] = x
     for kind, y in (("gyro_scaling", unknowns.gyro_scaling), ("accel_scaling", unknowns.accel_scaling)):
         if y is not None:

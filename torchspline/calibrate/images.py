@@ -46,6 +46,10 @@ PROJECTIONS: dict[str, type[Residual]] = {
 #: Corners whose rows are made at a time: they stay in the cache.
 _CHUNK = 4096
 _POSE, _INTRINSICS = 6, 8
+_TOGETHER = (
+    "ImageBlock: the corners of an image are evaluated together, by fit.Problem; use ReprojectionRadtan or "
+    "ReprojectionEquidistant elsewhere"
+)
 
 
 @dataclass
@@ -239,7 +243,7 @@ class ImageBlock(Residual):
     def evaluate(
         self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
     ) -> Vector:
-        raise NotImplementedError("the corners of an image are evaluated together, see _ImageTerm")
+        raise NotImplementedError(_TOGETHER)
 
     def reverse(
         self,
@@ -249,7 +253,7 @@ class ImageBlock(Residual):
         measured: Vector,
         g: Vector,
     ) -> tuple[list[Moment], dict[str, Vector]]:
-        raise NotImplementedError("the corners of an image are evaluated together, see _ImageTerm")
+        raise NotImplementedError(_TOGETHER)
 
     def __repr__(self) -> str:
         return f"{self.name}({self.count} corners in {len(self)} images)"

@@ -84,6 +84,8 @@ class Layout:
     gravity: Variable
     cameras: list[CameraUnknowns] = field(default_factory=list)
     imus: list[ImuUnknowns] = field(default_factory=list)
+    #: What is known beforehand.
+    frozen: list[Variable] = field(default_factory=list)
 
     @property
     def residuals(self) -> list[Residual]:
@@ -164,6 +166,12 @@ def _through(t: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None:
     """Control points that no reading touches would be left open."""
     stamps = imu.window(first, last).time_ns
+    rate = (len(stamps) - 1) / max((last - first) / NS, 1e-9)
+    if rate * options.spacing < 0.999:
+        raise ValueError(
+            f"spacing: expected at least the {1 / max(rate, 1e-9):.4g} s between readings of the IMU, got "
+            f"{options.spacing:g}: every control point needs a reading"
+        )
     steps = stamps.diff()
     widest = (options.order - 1) * round(options.spacing * NS)
     if len(steps) and int(steps.max()) > widest:
@@ -172,12 +180,6 @@ def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None
             f"{imu.source or 'imus[0]'}: expected readings at most {widest / NS:g} s apart for a spline of order "
             f"{options.order} with knots every {options.spacing:g} s; got a gap of {int(steps[row]) / NS:.3f} s at "
             f"{int(stamps[row])} ns; use a larger spacing, or a part of the recording without the gap"
-        )
-    rate = (len(stamps) - 1) / max((last - first) / NS, 1e-9)
-    if rate * options.spacing < 0.999:
-        raise ValueError(
-            f"spacing: expected at least the {1 / max(rate, 1e-9):.4g} s between readings of the IMU, got "
-            f"{options.spacing:g}: every control point needs a reading"
         )
 
 
@@ -276,10 +278,11 @@ def _add_camera(layout: Layout, recording: Recording, i: int, start: Start, opti
     shared: dict[str, Any] = {"intrinsics": intrinsics, "T_body_camera": extrinsics}
     if "line_delay" in options.estimate:
         delay = Variable(f"{number} line delay", torch.zeros(1, dtype=torch.float64))
+        # A `Clock` takes delays off stamps; lines below the middle are seen after the stamp.
         middle = 0.5 * (camera.resolution[1] - 1)
         residual = PROJECTIONS[camera.distortion](
             stamps[frame], uv, landmark=xyz, sigma=sigma, loss=options.loss, name=name, **shared,
-            clock=Clock(offset=ahead, delay=delay, late=uv[:, 1] - middle),
+            clock=Clock(offset=ahead, delay=delay, late=middle - uv[:, 1]),
         )  # fmt: skip
     else:
         residual = ImageBlock(
@@ -287,8 +290,8 @@ def _add_camera(layout: Layout, recording: Recording, i: int, start: Start, opti
             name=name, clock=Clock(offset=ahead), **shared,
         )  # fmt: skip
     problem.add(residual)
-    if "intrinsics" not in options.estimate:
-        problem.freeze(intrinsics)
-    if "time_offset" not in options.estimate:
-        problem.freeze(ahead)
+    for kind, variable in (("intrinsics", intrinsics), ("time_offset", ahead)):
+        if kind not in options.estimate:
+            problem.freeze(variable)
+            layout.frozen.append(variable)
     layout.cameras.append(CameraUnknowns(extrinsics, ahead, intrinsics, delay, residual, images, kept))

@@ -77,6 +77,8 @@ def simulate(
     checks.positive("seconds", seconds)
     for name, x in (("images", images), ("samples", samples), ("cameras", cameras)):
         checks.whole(name, x, least=1)
+    checks.whole("order", order, least=4)
+    checks.whole("seed", seed, least=0)
     checks.choice("representation", representation, tuple(GROUPS))
     checks.choice("distortion", distortion, tuple(PROJECTIONS))
     checks.positive("spacing", spacing)

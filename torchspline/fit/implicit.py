@@ -228,6 +228,7 @@ def _of_term(term: Term, numbers: Numbers, given: Numbers) -> Tensor:
                 back[term.order] = np.arange(len(back))
                 own = own[torch.from_numpy(term.index[slot][back])]
         vectors.append(own)
+    assert isinstance(term.kernel, ResidualKernel)
     error = term.kernel.on_tensors(*vectors)
     kind, weights = residual.weighting
     root = square_root_information((kind, None if weights is None else of(weights)))

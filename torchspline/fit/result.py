@@ -202,22 +202,6 @@ class Result:
         found = torch.from_numpy(np.sqrt(np.square(self._scatter[stretch][:, columns]).sum(axis=0)))
         return torch.maximum(own, found.reshape(own.shape))
 
-    def point_deviation(self, spline: BSpline) -> Tensor:
-        """Standard deviations of the steps of a spline's control points, `(M, D)`; 0 for those that stayed.
-
-        Raises:
-            ValueError: the measurements do not determine all unknowns.
-        """
-        columns = self._linearizer.model.columns[id(spline)]
-        there = columns >= 0
-        variances = np.zeros(columns.shape)
-        variances[there] = self._determined().inverse(columns[there], columns[there])
-        return torch.from_numpy(np.sqrt(variances))
-
-    def is_estimated(self, variable: Variable) -> bool:
-        """Whether a variable was among the unknowns, not frozen."""
-        return id(variable) in self._linearizer.model.columns
-
     def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
         """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.
 
@@ -317,3 +301,18 @@ class Result:
             for i, spline in enumerate(model.splines)
         ]
         return names + [(variable.name, variable) for variable in model.variables]
+
+
+def control_point_deviation(result: Result, spline: BSpline) -> Tensor:
+    """Standard deviations of the steps of the control points of one of the problem's splines, `(M, D)`.
+
+    Those that stayed have 0.
+
+    Raises:
+        ValueError: the measurements do not determine all unknowns.
+    """
+    columns = result._linearizer.model.columns[id(spline)]
+    there = columns >= 0
+    variances = np.zeros(columns.shape)
+    variances[there] = result._determined().inverse(columns[there], columns[there])
+    return torch.from_numpy(np.sqrt(variances))

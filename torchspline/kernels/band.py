@@ -66,6 +66,8 @@ def inverse_band(fused: bool, lower: Array) -> Array:
     # Beyond the end the factor may hold anything.
     n, width = lower.shape
     lower = np.where(np.arange(n)[:, None] + np.arange(width) < n, lower, 0.0)
+    if n == 0:
+        return lower
     if not fused:
         return _reference(lower)
     out = np.empty((n, width))
