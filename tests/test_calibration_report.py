@@ -277,3 +277,25 @@ def test_the_command_refuses_options(files, option, words):
     arguments = ["--imu", files / "imu.csv", "--corners", files / "cam0.npz", files / "cam1.npz"]
     with pytest.raises(ValueError, match=words):
         command.run([*map(str, arguments), "--config", str(files / "config.yaml"), option])
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+def test_the_command_calibrates_a_real_recording(shared_data, tmp_path):
+    real = shared_data / "camera_imu_april"
+    done = run(
+        "--imu", real / "imu0.csv.gz", "--corners", real / "cam0_corners.npz", real / "cam1_corners.npz", "--config",
+        real / "config.yaml", "--out", tmp_path, "--start", "5", "--duration", "25",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert content["solver"]["converged"] is True
+    chain = read_camchain(tmp_path / "camchain-imucam.yaml")
+    # The pair is 11 cm wide and almost parallel.
+    between = SE3.between(*chain.T_imu_cam)
+    assert float(between[:3].norm()) == pytest.approx(0.110, abs=0.002)
+    assert float(SO3.log(between[3:]).norm()) < math.radians(1.5)
+    for i in range(2):
+        assert content["residuals"][f"cam{i}"]["median_length"] < 0.5
+        assert abs(content[f"time_offset_cam{i}"]["value"]) < 1e-3
+    assert content["residuals"]["imu0 gyroscope"]["rms"] == pytest.approx([0.005] * 3, abs=0.004)
