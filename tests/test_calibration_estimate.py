@@ -309,14 +309,14 @@ def test_recordings_that_cannot_be_calibrated(simulated, start):
     imu = recording.imus[0]
     late = ImuRecord(imu.time_ns + 50 * 10**9, imu.gyroscope, imu.accelerometer)
     with pytest.raises(
-        ValueError, match="expected images while the IMU measured.*are the clocks synchronised"
+        ValueError, match=r"expected images while the IMU measured.*are the clocks synchronised"
     ):
         calibrate(replace(recording, imus=(late,)), start, spacing=0.05)
     keep = (imu.time < 2.0) | (imu.time > 3.0)
     gap = ImuRecord(*(x[keep] for x in (imu.time_ns, imu.gyroscope, imu.accelerometer)))
     with pytest.raises(ValueError, match=r"readings at most 0.2 s apart .* got a gap of 1.0\d* s"):
         calibrate(replace(recording, imus=(gap,)), start, spacing=0.05)
-    with pytest.raises(ValueError, match="start: expected 1 rows of T_imu_cam, .* got 2"):
+    with pytest.raises(ValueError, match=r"start: expected 1 rows of T_imu_cam, .* got 2"):
         calibrate(recording.only(0), start, spacing=0.05)
 
 

@@ -1,4 +1,4 @@
-"""Images as one measurement each, and the linear algebra that calibration adds: against single corners and dense oracles."""
+"""Images as one measurement each, and the linear algebra that calibration adds, against dense oracles."""
 
 import numpy as np
 import pytest
