@@ -15,7 +15,7 @@ import pytest
 import torch
 import yaml
 
-from torchspline import SE3, SO3, BSpline
+from torchspline import R3, SE3, SO3, BSpline
 from torchspline.calibrate import command, figures, write_calibration
 from torchspline.calibrate.coverage import CELLS, coverage
 from torchspline.calibrate.estimate import Calibration, calibrate
@@ -141,6 +141,39 @@ def test_names_cannot_smuggle_in_markup(calibration, tmp_path, monkeypatch):
     write_calibration(tmp_path, odd)
     Page((tmp_path / "report.html").read_text())  # refuses scripts
     assert json.loads((tmp_path / "result.json").read_text())["notes"] == odd.notes
+
+
+def test_everything_that_can_be_estimated_is_reported(calibration, tmp_path, monkeypatch):
+    """Line delays, scales, biases over time and a second IMU, with numbers put in by hand."""
+    for name in ("residuals_over_time", "residuals_over_image", "distributions", "readings", "motion"):
+        monkeypatch.setattr(figures, name, lambda *arguments: b"")
+    delayed = replace(
+        calibration.cameras[0], line_delay=2e-5, line_delay_sigma=3e-7, intrinsics_sigma=torch.ones(8)
+    )
+    spline = BSpline(torch.zeros(7, 3).double(), group=R3, order=4, dt_ns=2 * 10**9, t0_ns=0, learnable=False)
+    second = replace(
+        calibration.imus[0], name="imu1", T_imu0_imu_sigma=torch.full((6,), 0.25), time_offset=0.5,
+        time_offset_sigma=1e-3, gyro_scaling=torch.eye(3), gyro_scaling_sigma=torch.full((3, 3), 0.125),
+        gyro_bias=torch.arange(21.0).reshape(7, 3), gyro_bias_sigma=torch.full((7, 3), 0.5), gyro_bias_spline=spline,
+    )  # fmt: skip
+    recording = calibration.recording
+    two = replace(recording, imus=recording.imus * 2, noise=recording.noise * 2)
+    imus, cameras = (calibration.imus[0], second), (delayed, calibration.cameras[1])
+    write_calibration(tmp_path, replace(calibration, cameras=cameras, imus=imus, recording=two))
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert content["line_delay_cam0"] == {"value": 2e-5, "sigma": 3e-7}
+    assert content["intrinsics_cam0"]["sigma"] == [1.0] * 8
+    assert content["imu1"]["T_imu0_imu"]["rotation_sigma"] == [0.25] * 3
+    assert content["imu1"]["time_offset"] == {"value": 0.5, "sigma": 1e-3}
+    assert content["imu1"]["gyro_scaling"]["sigma"] == [[0.125] * 3] * 3
+    assert content["imu1"]["gyro_bias"]["value"] == torch.arange(21.0).reshape(7, 3).tolist()
+    assert content["imu1"]["gyro_bias_spline"] == {"order": 4, "start_ns": 0, "spacing_ns": 2 * 10**9}
+    words = " ".join(Page((tmp_path / "report.html").read_text()).words)
+    for word in (
+        "line delay [µs]", "20.00", "imu1 time offset [ms]", "imu1 gyro_scaling xx", "imu1 position y in imu0 [m]",
+        "imu1 gyroscope bias, in the middle of the recording z [rad/s]", "11.0",
+    ):  # fmt: skip
+        assert word in words, word
 
 
 def test_folders_that_cannot_be(calibration, tmp_path):

@@ -162,8 +162,9 @@ def _imu_table(calibration: Calibration) -> str:
             ("accelerometer bias", "m/s²", imu.accel_bias, imu.accel_bias_sigma),
         ):
             varies = value.ndim > 1
-            value, sigma = (x.mean(0) if varies else x for x in (value, sigma))
-            label = f"{imu.name} {what}{', mean over time' if varies else ''}"
+            # Control points of a spline: those at its ends know least.
+            value, sigma = (x[len(x) // 2] if varies else x for x in (value, sigma))
+            label = f"{imu.name} {what}{', in the middle of the recording' if varies else ''}"
             rows += [
                 (f"{label} {a} [{unit}]", x, y)
                 for a, x, y in zip(_AXES, value.tolist(), sigma.tolist(), strict=True)
