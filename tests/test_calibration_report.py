@@ -16,11 +16,12 @@ import torch
 import yaml
 
 from torchspline import R3, SE3, SO3, BSpline
-from torchspline.calibrate import command, figures, write_calibration
+from torchspline.calibrate import command, figures, find_start, write_calibration
 from torchspline.calibrate.coverage import CELLS, coverage
 from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.simulate import Simulation, simulate
-from torchspline.io import read_camchain, write_imu
+from torchspline.fit import Result
+from torchspline.io import ImuRecord, read_camchain, write_imu
 
 SPACING = 0.05
 FILES = ("result.json", "camchain-imucam.yaml", "report.html")
@@ -332,3 +333,27 @@ def test_the_command_calibrates_a_real_recording(shared_data, tmp_path):
         assert content["residuals"][f"cam{i}"]["median_length"] < 0.5
         assert abs(content[f"time_offset_cam{i}"]["value"]) < 1e-3
     assert content["residuals"]["imu0 gyroscope"]["rms"] == pytest.approx([0.005] * 3, abs=0.004)
+
+
+def test_biases_over_time_of_a_second_imu_with_a_clock_of_its_own():
+    made = simulate(seconds=3.0, images=30, samples=300, cameras=1, order=5, spacing=0.1, seed=2).recording
+    first = made.imus[0]
+    second = ImuRecord(first.time_ns + 400_000_000, first.gyroscope, first.accelerometer, "second")
+    both = replace(made, imus=(first, second), noise=made.noise * 2)
+    found = calibrate(both, spacing=0.1, bias_spacing=1.5, reweigh=False)
+    assert found.imus[1].time_offset == pytest.approx(0.4, abs=1e-3)
+    for imu, record in zip(found.imus, both.imus, strict=True):
+        low, high = imu.gyro_bias_spline.domain
+        assert low <= int(record.time_ns[0]) < int(record.time_ns[-1]) <= high
+        assert bool((imu.gyro_bias_sigma < 0.1).all())
+
+
+def test_too_many_unknowns_for_stretches_are_a_note(calibration, monkeypatch):
+    recording, options = calibration.recording.only(0), {"spacing": SPACING, "reweigh": False}
+    start = find_start(recording)
+    plain = calibrate(recording, start, stretch=None, **options)
+    monkeypatch.setattr(Result, "banded", property(lambda self: False))
+    wide = calibrate(recording, start, **options)
+    assert any("independent errors only" in note for note in wide.notes)
+    assert not any("independent errors only" in note for note in plain.notes)
+    assert torch.equal(wide.cameras[0].T_imu_cam_sigma, plain.cameras[0].T_imu_cam_sigma)
