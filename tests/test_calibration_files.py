@@ -14,8 +14,6 @@ from torchspline import SE3
 from torchspline.calibrate import Corners, ImuNoise, Recording, read_corners, read_recording
 from torchspline.io import CamChain, Camera, ImuRecord, read_camchain, write_camchain, write_imu
 
-REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "camera_imu_april"
-realdata = pytest.mark.skipif(not REAL.is_dir(), reason=f"no recording at {REAL}")
 CONFIG = {
     "calib_target": {
         "target_type": "aprilgrid", "tag_rows": 2, "tag_cols": 3, "tag_size": 0.1, "tag_spacing": 0.5,
@@ -103,11 +101,11 @@ def test_kalibrs_words_are_understood(folder):
     assert recording.gravity == 9.80665
 
 
-@realdata
 @pytest.mark.realdata
-def test_the_real_recording_is_read():
+def test_the_real_recording_is_read(shared_data):
+    real = shared_data / "camera_imu_april"
     recording = read_recording(
-        REAL / "config.yaml", [REAL / "cam0_corners.npz", REAL / "cam1_corners.npz"], [REAL / "imu0.csv.gz"]
+        real / "config.yaml", [real / "cam0_corners.npz", real / "cam1_corners.npz"], [real / "imu0.csv.gz"]
     )
     assert [len(x.t_ns) for x in recording.corners] == [1416, 1416]
     assert [len(x) for x in recording.corners] == [179_524, 178_764]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from torchspline.calibrate.simulate import Simulation, simulate
 from torchspline.io import ImuRecord
 
 NS = 1_000_000_000
-REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "camera_imu_april"
-realdata = pytest.mark.skipif(not REAL.is_dir(), reason=f"no recording at {REAL}")
 
 
 @pytest.fixture(scope="module")
@@ -339,12 +336,12 @@ def test_no_imu(recording):
 # ---------------------------------------------------------------------- the real recording
 
 
-@realdata
 @pytest.mark.realdata
 @pytest.mark.slow
-def test_real_recording():
+def test_real_recording(shared_data):
+    real = shared_data / "camera_imu_april"
     recording = read_recording(
-        REAL / "config.yaml", [REAL / "cam0_corners.npz", REAL / "cam1_corners.npz"], [REAL / "imu0.csv.gz"]
+        real / "config.yaml", [real / "cam0_corners.npz", real / "cam1_corners.npz"], [real / "imu0.csv.gz"]
     )
     found = find_start(recording)
     # What independent poses of each image reach, see the data's own notes.

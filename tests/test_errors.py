@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_calibration_files
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -18,7 +19,7 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = error_online.CASES
+CASES = error_online.CASES + error_calibration_files.CASES
 
 
 def label(case: Case) -> str:
@@ -68,7 +69,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_calibration_files.ROOTS):
         visit(root)
     return found
 
@@ -212,8 +213,9 @@ NOT_APPLICABLE = {
     },
 }
 
-for _category, _reasons in error_online.NOT_APPLICABLE.items():
-    NOT_APPLICABLE[_category].update(_reasons)
+for _more in (error_online, error_calibration_files):
+    for _category, _reasons in _more.NOT_APPLICABLE.items():
+        NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}

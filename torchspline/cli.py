@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `torchspline imu`, `torchspline kernels show`."""
+"""The command line: `torchspline demo`, `imu`, `calibrate camera-imu`, `kernels show`."""
 
 import json
 import math
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from torchspline.calibrate.command import COMMAND, camera_imu, run
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.groups import SO3, Group
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
@@ -340,8 +341,11 @@ def main() -> None:
     """Entry point of the `torchspline` command."""
     from jsonargparse import CLI
 
+    words = sys.argv[1:]
+    commands = {"demo": demo, "imu": imu, "calibrate": {"camera-imu": camera_imu}, "kernels": {"show": show}}
     try:
-        status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
+        own = tuple(words[:2]) == COMMAND
+        status = run(words[2:]) if own else CLI(commands, prog="torchspline")
     except (TypeError, ValueError, OSError, MemoryError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchspline import checks
@@ -92,7 +93,7 @@ def board_poses(camera: Camera, corners: Corners) -> BoardPoses:
     reason = np.zeros(len(counts), np.int64)
     reason[_narrow(corners, counts)] = 2
     reason[counts < FEWEST] = 1
-    pose = np.full((len(counts), 7), math.nan)
+    pose, rotation = np.full((len(counts), 7), math.nan), np.tile(np.eye(3), (len(counts), 1, 1))
     rms = np.full(len(counts), math.nan)
     error = np.full((len(corners), 2), math.nan)
     tried = np.flatnonzero(reason == 0)
@@ -101,9 +102,10 @@ def board_poses(camera: Camera, corners: Corners) -> BoardPoses:
         images = tried[begin : begin + _BLOCK]
         block = _gather(corners, first[images], counts[images])
         R, t, residual = _refine(camera, block, *_start(camera, block))
-        pose[images] = np.concatenate([t, SO3.from_matrix(torch.from_numpy(R)).numpy()], axis=1)
+        rotation[images], pose[images, :3] = R, t
         rms[images] = np.sqrt((residual**2).sum(axis=(0, 2)) / counts[images])
         error[block.rows[block.there]] = residual[:, block.there].T
+    pose[:, 3:] = SO3.from_matrix(torch.from_numpy(rotation)).numpy()
     reason[rms > MISFIT] = 3
     pose[reason != 0] = math.nan
     notes = [
@@ -283,7 +285,7 @@ def _refine(camera: Camera, block: _Block, R: Array, t: Array) -> tuple[Array, A
         damped = state.matrix.copy()
         damped[:, range(6), range(6)] += damping[:, None] * diagonal + 1e-9
         step = -np.linalg.solve(damped, state.gradient[..., None])[..., 0]
-        turn = SO3.to_matrix(SO3.exp(torch.from_numpy(step[:, 3:]))).numpy()
+        turn = Rotation.from_rotvec(step[:, 3:]).as_matrix()
         tried = turn @ R, (turn @ t[..., None])[..., 0] + step[:, :3]
         after = _linearize(camera, block, *tried)
         better = after.cost <= state.cost

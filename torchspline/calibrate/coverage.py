@@ -131,16 +131,21 @@ def _images(calibration: Calibration, i: int) -> ImageCoverage:
 def _quiet(x: Tensor, limit: float, what: str, unit: str, unsure: str) -> list[str]:
     """A warning for each direction of the first IMU in which there was little."""
     values, axes = torch.linalg.eigh(x.mT @ x / len(x))
-    found = []
-    for value, axis in zip(values.clamp_min(0.0).sqrt().tolist(), axes.mT, strict=True):
-        if value < limit:
-            largest = int(axis.abs().argmax())
-            plain = float(axis.abs()[largest]) > 0.95
-            name = "xyz"[largest] if plain else f"[{', '.join(f'{y:.2f}' for y in axis.tolist())}]"
-            found.append(
-                f"{what} {name} of the first IMU was hardly excited ({value:.2g} {unit} RMS): {unsure} stay unsure"
-            )
-    return found
+    values = values.clamp_min(0.0).sqrt()
+    quiet = axes[:, values < limit]
+    # Which of several quiet directions an eigenvector takes is chance: axes that lie among them have names.
+    plain = torch.nonzero(quiet.square().sum(dim=1) > 0.9).flatten().tolist()
+    if len(plain) == quiet.shape[1]:
+        there = [("xyz"[i], float(x[:, i].square().mean().sqrt())) for i in plain]
+    else:
+        there = [
+            (f"[{', '.join(f'{y:.2f}' for y in axis.tolist())}]", float((x @ axis).square().mean().sqrt()))
+            for axis in quiet.mT
+        ]
+    return [
+        f"{what} {name} of the first IMU was hardly excited ({value:.2g} {unit} RMS): {unsure} stay unsure"
+        for name, value in there
+    ]
 
 
 def _of_camera(found: CalibratedCamera, image: ImageCoverage) -> list[str]:

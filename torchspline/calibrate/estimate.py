@@ -242,6 +242,12 @@ def calibrate(
     result = solve(cost_tolerance=cost_tolerance)
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
+    notes = _notes(result, start)
+    if stretch is not None and not result.banded:
+        stretch = None
+        notes.append(
+            "standard deviations hold for independent errors only: there are too many unknowns for stretches"
+        )
     found = _Found(layout, result, stretch, stated, layout.frozen)
     cameras = tuple(_camera(recording, found, i) for i in range(len(recording.cameras)))
     imus = tuple(_imu(found, i) for i in range(len(recording.imus)))
@@ -251,7 +257,7 @@ def calibrate(
     seconds["total"] = perf_counter() - begin
     return Calibration(
         cameras, imus, layout.gravity.value, gravity_sigma, layout.trajectory, result, recording, start,
-        seconds, _notes(result, start),
+        seconds, notes,
     )  # fmt: skip
 
 

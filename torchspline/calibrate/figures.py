@@ -59,7 +59,7 @@ def residuals_over_image(calibration: Calibration) -> bytes:
         rms = np.sqrt(np.bincount(where, (error**2).sum(axis=1), size) / n)
         shape, extent = (CELLS[1], CELLS[0]), (0, width, height, 0)
         seen = np.where(count > 0, count, np.nan).reshape(shape)
-        picture = row[0].imshow(seen, extent=extent, cmap="viridis", aspect="equal")
+        picture = row[0].imshow(seen, extent=extent, cmap="viridis", norm="log", aspect="equal")
         figure.colorbar(picture, ax=row[0], label="corners")
         row[0].set_title(f"{found.name}: corners that took part", fontsize=9, loc="left")
         picture = row[1].imshow(
@@ -75,7 +75,7 @@ def residuals_over_image(calibration: Calibration) -> bytes:
         there = (count > 20).reshape(shape)
         gx, gy = np.meshgrid(x, y)
         lengths = np.hypot(*mean).reshape(shape)[there]
-        longest = max(float(lengths.max(initial=0.0)), 0.02)
+        longest = max(float(np.quantile(lengths, 0.95)) if lengths.size else 0.0, 0.02)
         arrows = row[1].quiver(
             gx[there], gy[there], mean[0].reshape(shape)[there], mean[1].reshape(shape)[there],
             angles="xy", scale_units="xy", scale=longest / (0.8 * width / CELLS[0]), width=0.004,
@@ -155,7 +155,7 @@ def motion(calibration: Calibration) -> bytes:
         axes.legend(fontsize=7)
     x, y, z = state.position.numpy().T
     all_axes[0, 2].plot(x, y, linewidth=0.5, color="0.4")
-    dots = all_axes[0, 2].scatter(x, y, c=z, s=4)
+    dots = all_axes[0, 2].scatter(x, y, c=z, s=1.5)
     figure.colorbar(dots, ax=all_axes[0, 2], label="z [m]")
     all_axes[0, 2].set_title("path in front of the board, x and y [m]", fontsize=9, loc="left")
     all_axes[0, 2].set_aspect("equal", adjustable="datalim")

@@ -205,8 +205,8 @@ def _add_imu(layout: Layout, recording: Recording, i: int, start: Start, options
         # `t_imu_i = t_imu0 + offset`, as a `Clock` has it.
         ahead = Variable(f"imu{i} ahead", start.imu_time_offset[i : i + 1])
         clock = Clock(offset=ahead)
-    gyro_bias = _bias(f"imu{i} gyro bias", start.gyro_bias[i], layout.trajectory, options)
-    accel_bias = _bias(f"imu{i} accel bias", start.accel_bias[i], layout.trajectory, options)
+    gyro_bias = _bias(f"imu{i} gyro bias", start.gyro_bias[i], layout.trajectory, part.time_ns, options)
+    accel_bias = _bias(f"imu{i} accel bias", start.accel_bias[i], layout.trajectory, part.time_ns, options)
     scaling: dict[str, Variable] = {}
     if "imu_scaling" in options.estimate:
         for sensor in ("gyro", "accel"):
@@ -245,15 +245,19 @@ def _add_imu(layout: Layout, recording: Recording, i: int, start: Start, options
     )  # fmt: skip
 
 
-def _bias(name: str, value: Tensor, trajectory: BSpline, options: Options) -> Variable | BSpline:
-    """One for all times, or a spline over the trajectory's time."""
+def _bias(
+    name: str, value: Tensor, trajectory: BSpline, stamps: Tensor, options: Options
+) -> Variable | BSpline:
+    """One for all times, or a spline over the trajectory's time and all stamps of the sensor's own clock."""
     if options.bias_spacing is None:
         return Variable(name, value)
     first, last = trajectory.domain
-    dt, order = round(options.bias_spacing * NS), 4
-    count = -(-int(last - first) // dt) + order - 1
+    first, last = min(int(first), int(stamps[0])), max(int(last), int(stamps[-1]))
+    # Whole segments: a last one with a few readings only would leave its control point open.
+    segments, order = max(1, round((last - first) / (options.bias_spacing * NS))), 4
+    dt, count = -(-(last - first) // segments), segments + order - 1
     points = value.repeat(count, 1)
-    return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=int(first), learnable=False)
+    return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=first, learnable=False)
 
 
 def _add_camera(layout: Layout, recording: Recording, i: int, start: Start, options: Options) -> None:

@@ -94,7 +94,7 @@ class Corners:
         numbers = np.cumsum(kept) - 1
         columns = {name: getattr(self, name).numpy()[rows] for name in ("uv", "xyz", "tag_id", "corner")}
         columns |= {"t_ns": self.t_ns.numpy()[kept], "frame": numbers[frame[rows]]}
-        return replace(self, **{name: torch.from_numpy(x) for name, x in columns.items()})
+        return Corners(**{name: torch.from_numpy(x) for name, x in columns.items()}, source=self.source)
 
 
 @dataclass(frozen=True)

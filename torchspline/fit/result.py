@@ -239,6 +239,11 @@ class Result:
 
     # ------------------------------------------------------------------ what is left open
 
+    @property
+    def banded(self) -> bool:
+        """Whether the normal equations are a band with a narrow border, as `standard_deviation` wants for stretches."""
+        return isinstance(self._system, BandSystem)
+
     @cached_property
     def observability(self) -> list[OpenDirection]:
         """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
