@@ -5,6 +5,7 @@ is made by forward differentiation. The solver around them is the library's, so 
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -37,10 +38,10 @@ def by_recurrence(group: Group, order: int, spacing: float, derivatives: int) ->
 
     def states(points: Tensor, u: Tensor) -> list[Tensor]:
         vectors = [algebra.normalize(split(p)) for p in points.unbind(0)]
-        steps = [
-            algebra.log(algebra.between(a, b)) for a, b in zip(vectors[:-1], vectors[1:], strict=True)
-        ]
-        value, trace = forward(algebra, vectors[0], steps, cumulative_weights(u, order, derivatives), derivatives)
+        steps = [algebra.log(algebra.between(a, b)) for a, b in pairwise(vectors)]
+        value, trace = forward(
+            algebra, vectors[0], steps, cumulative_weights(u, order, derivatives), derivatives
+        )
         rates = [join(rate, points[0, :0]) for rate in trace[-1].rates] if derivatives else []
         return [join(value, points[0, :0]), *(x / spacing ** (r + 1) for r, x in enumerate(rates))]
 
@@ -109,7 +110,10 @@ class AutomaticTerm:
             rows.append(np.concatenate([weighted, error[..., None]], axis=-1))
         bases = np.zeros((len(places.starts) - 1, 0), np.int64)  # these are control points already
         system.add(
-            Rows(np.ascontiguousarray(np.concatenate(rows)), places.starts, bases, places.columns, spline.order), state.chain
+            Rows(
+                np.ascontiguousarray(np.concatenate(rows)), places.starts, bases, places.columns, spline.order
+            ),
+            state.chain,
         )
 
     def _function(self, state: State) -> tuple[Callable[..., tuple[Tensor, Tensor]], int, list[Tensor]]:
