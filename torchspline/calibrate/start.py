@@ -38,8 +38,8 @@ _TRIED, _BETTER = 50, 0.05
 _APART, _TILTED = 0.1, math.radians(3.0)
 #: Median length of an accelerometer's readings as a share of gravity.
 _AROUND_GRAVITY = (0.5, 2.0)
-#: Least shares of the variance of gyroscope and accelerometer that the aligned spline explains, and errors (m/s^2) of the
-#: latter below which that does not matter.
+#: Least shares of the variance of gyroscope and accelerometer that the aligned spline explains, and errors (m/s^2)
+#: of the latter below which that does not matter.
 _TURNS_EXPLAINED, _FORCE_EXPLAINED, _SMALL_FORCE = 0.5, 0.9, 0.5
 
 
@@ -276,8 +276,8 @@ def _aligned(
         )
     if force < _FORCE_EXPLAINED and miss > _SMALL_FORCE:
         notes.append(
-            f"{names}: the motion explains {max(force, 0.0):.0%} of the accelerometer's variance only: are its axes those "
-            "of the gyroscope, and are the size of the board and the focal lengths right?"
+            f"{names}: the motion explains {max(force, 0.0):.0%} of the accelerometer's variance only: are its "
+            "axes those of the gyroscope, and are the size of the board and the focal lengths right?"
         )
     # Readings far off are the rule here: the first spline is too stiff for the fastest motion.
     notes += [f"{names}: {note}" for note in found.notes if "standard deviations off" not in note]
