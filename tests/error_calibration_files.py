@@ -321,14 +321,16 @@ NOT_APPLICABLE = {
     },
     "nan": {
         "files, whose numbers are tried in test_calibration_files.py": f"{_FILES}",
-        "no numbers that can be one": "Corners.select Recording.only board_poses",
+        "choices and what was checked": "Corners.select Recording.only board_poses",
     },
     "zero quaternion": {
-        "no quaternion in it": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera Corners Corners.select",
+        "no quaternion in recordings": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera Corners Corners.select",
     },
     "count": {
-        "one of it": "Camera ImuNoise write_camchain write_calibration read_corners Recording.between",
+        "one camera, one IMU, one file": "Camera ImuNoise write_camchain write_calibration read_corners Recording.between",
         "any number of images": "Corners.select board_poses",
     },
-    "time": {"no times": f"{_FILES} Camera CamChain Corners.select ImuNoise Recording.only board_poses"},
+    "time": {
+        "no times in files, cameras and boards": f"{_FILES} Camera CamChain Corners.select ImuNoise Recording.only board_poses"
+    },
 }
