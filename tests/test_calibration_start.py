@@ -329,6 +329,35 @@ def test_an_imu_of_another_recording(recording):
     assert "same recording" in message
 
 
+def test_readings_in_other_units(recording):
+    imu = recording.imus[0]
+    weights = replace(imu, accelerometer=imu.accelerometer / 9.80665)
+    assert "imu0: accelerometer: expected specific forces" in message_of(replace(recording, imus=(weights,)))
+    degrees = replace(imu, gyroscope=imu.gyroscope.rad2deg())
+    assert "are the readings in rad/s" in message_of(replace(recording, imus=(degrees,)))
+
+
+def test_mirrored_axes(recording):
+    imu = recording.imus[0]
+    mirrored = replace(imu, gyroscope=imu.gyroscope * torch.tensor([1.0, 1.0, -1.0]))
+    message = message_of(replace(recording.only(0), imus=(mirrored,)))
+    assert "cam0 with imu0: gyro" in message
+    other = replace(imu, accelerometer=imu.accelerometer[:, [1, 0, 2]])
+    found = find_start(replace(recording.only(0), imus=(other,)))
+    (note,) = found.notes
+    assert "of the accelerometer's variance only: are its axes those of the gyroscope" in note
+
+
+def test_gaps_between_images(simulated):
+    """Three seconds of ten without images: the spline through the poses has to be led through calmly."""
+    recording = simulated.recording
+    gap = [(c.t_ns - c.t_ns[0] < 4 * NS) | (c.t_ns - c.t_ns[0] > 7 * NS) for c in recording.corners]
+    some = replace(
+        recording, corners=tuple(c.select(images) for c, images in zip(recording.corners, gap, strict=True))
+    )
+    check_start(find_start(some), simulated, simulated.time_offset)
+
+
 def test_no_imu(recording):
     assert "at least one IMU" in message_of(replace(recording, imus=(), noise=()))
 

@@ -25,6 +25,8 @@ _FEWEST_IMAGES, _MOST_MISFITS = 20, 0.3
 #: Knots of the first spline: this many image intervals apart, at least so many seconds.
 _KNOT_INTERVALS, _SHORTEST_KNOT = 2.0, 0.05
 _ORDER = 6
+#: Of that spline: enough to lead it calmly through gaps between images, too little to be felt where there are some.
+_SMOOTHNESS = 1e-3
 #: Poses this many times farther from the spline than the median are left out of it.
 _STRAY = 50.0
 #: IMU readings are averaged until only so many are left for each image: faster, and all that the first spline can use.
@@ -34,6 +36,11 @@ _READINGS_PER_IMAGE = 2.5
 _TRIED, _BETTER = 50, 0.05
 #: Clocks farther apart than this (s) are worth a note, as are directions of gravity (rad).
 _APART, _TILTED = 0.1, math.radians(3.0)
+#: Median length of an accelerometer's readings as a share of gravity.
+_AROUND_GRAVITY = (0.5, 2.0)
+#: Least shares of the variance of gyroscope and accelerometer that the aligned spline explains, and errors (m/s^2)
+#: of the latter below which that does not matter.
+_TURNS_EXPLAINED, _FORCE_EXPLAINED, _SMALL_FORCE = 0.5, 0.9, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +227,8 @@ def _spline(recording: Recording, i: int, board: BoardPoses, notes: list[str]) -
     dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / _NS, _SHORTEST_KNOT)
 
     def fit(t: Tensor, poses: Tensor) -> Any:
-        return fit_poses(t, poses, dt=dt, order=_ORDER, max_iterations=10, tolerance=1e-4, progress=False)
+        options = {"smoothness": _SMOOTHNESS, "max_iterations": 10, "tolerance": 1e-4}
+        return fit_poses(t, poses, dt=dt, order=_ORDER, progress=False, **options)
 
     found = fit(t, poses)
     miss = torch.stack([found.position_residual.norm(dim=1), found.rotation_residual.norm(dim=1)])
@@ -241,6 +249,12 @@ def _aligned(
     """Camera i with IMU j."""
     names = f"{recording.cameras[i].name} with imu{j}"
     imu = _thinned(recording.imus[j], recording.corners[i])
+    length = float(imu.accelerometer.norm(dim=1).median()) if len(imu) else recording.gravity
+    if not _AROUND_GRAVITY[0] <= length / recording.gravity <= _AROUND_GRAVITY[1]:
+        raise ValueError(
+            f"imu{j}: accelerometer: expected specific forces around gravity, {recording.gravity:.4g} m/s^2, got a "
+            f"median length of {length:.4g}: are the readings in m/s^2?"
+        )
     try:
         found = align_imu(
             spline,
@@ -253,6 +267,18 @@ def _aligned(
         )
     except ValueError as error:
         raise ValueError(f"{names}: {error}") from None
+    turns = _explained(imu.gyroscope, found.gyro_rms)
+    force, miss = _explained(imu.accelerometer, found.accel_rms or 0.0), found.accel_rms or 0.0
+    if turns < _TURNS_EXPLAINED:
+        raise ValueError(
+            f"{names}: gyroscope: expected readings of the motion that the images show, but no rotation of the sensor "
+            f"makes it explain more than {max(turns, 0.0):.0%} of their variance: are axes mirrored or swapped?"
+        )
+    if force < _FORCE_EXPLAINED and miss > _SMALL_FORCE:
+        notes.append(
+            f"{names}: the motion explains {max(force, 0.0):.0%} of the accelerometer's variance only: are its "
+            "axes those of the gyroscope, and are the size of the board and the focal lengths right?"
+        )
     # Readings far off are the rule here: the first spline is too stiff for the fastest motion.
     notes += [f"{names}: {note}" for note in found.notes if "standard deviations off" not in note]
     if abs(found.time_offset) > _APART:
@@ -260,6 +286,11 @@ def _aligned(
             f"{names}: the clocks are {found.time_offset:.3f} s apart (t_imu = t_cam + {found.time_offset:.3f} s)"
         )
     return found
+
+
+def _explained(readings: Tensor, rms: float) -> float:
+    """Share of their variance that errors of this root mean square leave explained."""
+    return 1.0 - rms**2 / max(float(readings.var(dim=0).mean()), 1e-12)
 
 
 def _thinned(imu: ImuRecord, corners: Corners) -> ImuRecord:
