@@ -215,7 +215,9 @@ NOT_APPLICABLE = {
 
 for _more in (error_online, error_calibration_files):
     for _category, _reasons in _more.NOT_APPLICABLE.items():
-        NOT_APPLICABLE[_category].update(_reasons)
+        for _reason, _names in _reasons.items():
+            _known = NOT_APPLICABLE[_category].get(_reason, "")
+            NOT_APPLICABLE[_category][_reason] = f"{_known} {_names}"
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}

@@ -29,7 +29,9 @@ from torchspline.groups import SE3
 from torchspline.splines.bspline import BSpline
 
 #: The first solution, whose residuals say how noisy sensors are, need not be exact.
-_ROUGH = 1e-5
+_ROUGH = 1e-2
+#: Accelerometers hold fast motion so much tighter than slow that more damping, a share of the diagonal, slows down.
+_FIRST_DAMPING, _DAMPING = 1e-8, 1e-12
 _LOSS = Huber(3.0)
 
 
@@ -176,7 +178,7 @@ def calibrate(
     reweigh: bool = True,
     stretch: float | None = 2.0,
     max_iterations: int = 50,
-    cost_tolerance: float = 1e-9,
+    cost_tolerance: float = 1e-8,
     progress: bool = False,
 ) -> Calibration:
     """Extrinsics of cameras, gravity, biases and clocks, with the trajectory, from one recording.
@@ -234,12 +236,12 @@ def calibrate(
     now, seconds["weights"] = perf_counter(), 0.0
     solve = partial(layout.problem.solve, max_iterations=max_iterations, progress=progress)
     if reweigh:
-        first = solve(cost_tolerance=max(_ROUGH, cost_tolerance))
+        first = solve(cost_tolerance=max(_ROUGH, cost_tolerance), damping=_FIRST_DAMPING)
         before = perf_counter()
         for name, factor in noise_factors(first, layout.residuals).items():
             rescale(next(x for x in layout.residuals if x.name == name), factor)
         seconds["weights"] = perf_counter() - before
-    result = solve(cost_tolerance=cost_tolerance)
+    result = solve(cost_tolerance=cost_tolerance, damping=_DAMPING if reweigh else _FIRST_DAMPING)
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
     notes = _notes(result, start)

@@ -194,16 +194,14 @@ class BandFactor(Factor):
 
     def trace(self, other: System) -> float:
         assert isinstance(other, BandSystem)
-        n, corner, follow = self.n, self._inverse_corner, self._follow[: self.n]
-        carried = follow @ corner
-        total = 2.0 * float(np.einsum("nm,nm->", carried, other.border))
-        total += float(np.einsum("ab,ab->", corner, other.corner + np.tril(other.corner, -1).T))
-        for d in range(min(other.band.shape[1], n)):
-            inverse = np.einsum("na,na->n", carried[d:], follow[: n - d])
-            if d < self._inverse.shape[1]:
-                inverse += self._inverse[: n - d, d]
-            total += (1.0 if d == 0 else 2.0) * float(np.einsum("n,n->", inverse, other.band[: n - d, d]))
-        return total
+        width = min(other.band.shape[1], self._inverse.shape[1])
+        if other.band[:, width:].any():
+            raise ValueError("these columns are too far apart for elements of the inverse to be known")
+        corner = other.corner + np.tril(other.corner, -1).T
+        total = float(np.einsum("ab,ab->", self._inverse_corner, corner))
+        total += 2.0 * float(np.einsum("nm,nm->", self._inverse_border, other.border))
+        below = float(np.einsum("nd,nd->", self._whole_inverse[:, 1:width], other.band[:, 1:width]))
+        return total + 2.0 * below + float(np.einsum("n,n->", self._whole_inverse[:, 0], other.band[:, 0]))
 
     def border_steps(self, columns: Array) -> Array:
         """Rows `(..., m)` of the inverse at `columns`: how the border moves with a gradient there."""
@@ -211,9 +209,7 @@ class BandFactor(Factor):
 
     def diagonal(self) -> Array:
         """Of the inverse."""
-        outer = np.einsum("na,ab,nb->n", self._follow, self._inverse_corner, self._follow, optimize=True)
-        outer[: self.n] += self._inverse[:, 0]
-        return outer
+        return np.concatenate([self._whole_inverse[:, 0], np.diagonal(self._inverse_corner)])
 
     def _band_inverse(self, i: Array, j: Array) -> Array:
         first, apart = np.minimum(i, j), np.abs(i - j)
@@ -225,6 +221,19 @@ class BandFactor(Factor):
     def _inverse(self) -> Array:
         """`[j, d]`: element `(j + d, j)` of the inverse of the band alone."""
         return inverse_band(self._fused, self.chol.T)
+
+    @cached_property
+    def _whole_inverse(self) -> Array:
+        """The same of the inverse of all."""
+        n, follow, result = self.n, self._follow[: self.n], self._inverse.copy()
+        for d in range(min(result.shape[1], n)):
+            result[: n - d, d] += np.einsum("na,na->n", self._inverse_border[d:], follow[: n - d])
+        return result
+
+    @cached_property
+    def _inverse_border(self) -> Array:
+        """The part of the inverse between band and border."""
+        return self._follow[: self.n] @ self._inverse_corner
 
     @cached_property
     def _inverse_corner(self) -> Array:
