@@ -141,6 +141,8 @@ def cases() -> Iterator[Case]:
                 function, argument, "option", FOLDER.name, "got a folder", "expected a file",
                 named=Path(FOLDER.name).name,
             )  # fmt: skip
+    for bad in (0.0, -1.0, NAN):
+        yield refused("Result.standard_deviation", "stretch", "option", bad, f"got {bad}", "above zero")
     empty = file("", "empty.yaml")
     yield refused(
         "read_camchain", "path", "count", empty, "got NoneType", "expected sections", named="empty.yaml"
