@@ -329,10 +329,10 @@ NOT_APPLICABLE = {
         "no quaternion in recordings": f"{_FILES} {_CHECKED} {_PARTS} ImuNoise Camera Corners Corners.select",
     },
     "count": {
-        "one camera, one IMU, one file": "Camera ImuNoise write_camchain write_calibration read_corners Recording.between",
+        "one of each": "Camera ImuNoise write_camchain write_calibration read_corners Recording.between",
         "any number of images": "Corners.select board_poses",
     },
     "time": {
-        "no times in files, cameras and boards": f"{_FILES} Camera CamChain Corners.select ImuNoise Recording.only board_poses"
+        "no times in these": f"{_FILES} Camera CamChain Corners.select ImuNoise Recording.only board_poses",
     },
 }

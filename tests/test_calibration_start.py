@@ -1,6 +1,7 @@
 """Board poses and the start of a calibration: against simulated truth, OpenCV, and recordings that are wrong."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -249,7 +250,10 @@ def test_half_the_corners_mislabelled(recording):
     message = message_of(with_first(recording, scrambled(corners, torch.arange(len(corners)) % 2 == 0)))
     assert "cam0" in message
     assert "200 of 200 images" in message
-    assert "mislabelled throughout" in message
+    share = int(
+        re.search(r"(\d+)% of the corners contradict the rest of their image, all over", message).group(1)
+    )
+    assert share == pytest.approx(50, abs=5)
 
 
 def test_half_the_images_mislabelled(recording):
@@ -266,7 +270,15 @@ def test_two_mislabelled_tags_are_named(recording):
         delta = torch.tensor([(other % 6 - tag % 6) * 0.1144, (other // 6 - tag // 6) * 0.1144, 0.0])
         xyz[corners.tag_id == tag] += delta.double()
     message = message_of(with_first(recording, replace(corners, xyz=xyz)))
-    assert "tags 14, 21 stand out" in message
+    assert "above all those of tags 14, 21: are they mislabelled?" in message
+
+
+def test_all_corners_mislabelled(recording):
+    corners = recording.corners[0]
+    message = message_of(
+        with_first(recording, scrambled(corners, torch.ones(len(corners), dtype=torch.bool)))
+    )
+    assert "mislabelled throughout" in message
 
 
 def test_swapped_cameras(recording):

@@ -39,6 +39,8 @@ _SETTLED = 1e-7
 #: Angle to the optical axis up to which corners take part in a homography.
 _WIDEST = math.radians(80.0)
 _MODELS: dict[str, Any] = {"radtan": ReprojectionRadtan, "equidistant": ReprojectionEquidistant}
+#: Trials to find corners that agree, and errors (px) up to which they do, at first and in the end.
+_TRIALS, _AGREEING = 80, (8.0, MISFIT)
 #: Why an image has no pose.
 REASONS = ("", f"fewer than {FEWEST} corners", "corners on a line", f"more than {MISFIT:g} px RMS")
 
@@ -130,6 +132,47 @@ def _narrow(corners: Corners, counts: Array) -> Array:
     # Variances along and across the longest direction.
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     return middle - half <= _NARROW**2 * (middle + half)
+
+
+def contradictions(camera: Camera, corners: Corners, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Corners of some images that contradict the largest number of others that agree on a pose of the board.
+
+    Homographies from four corners at a time; of those the one with which most corners agree, as long as a good part of
+    them does [Fischler and Bolles 1981].
+
+    Args:
+        images: (B,) which, each with as many corners as a pose needs.
+    Returns:
+        Rows of corners that do not agree, and for each image the share of its corners that do, (B,).
+    """
+    first = corners.first.numpy()
+    chosen = images.numpy()
+    block = _gather(corners, first[chosen], np.diff(first)[chosen])
+    a, b, valid = _undistort(camera, block.u, block.v)
+    usable = block.there & valid
+    random = np.random.default_rng(0).random((len(chosen), _TRIALS, usable.shape[1])) + ~usable[:, None]
+    four = np.argsort(random, axis=2)[:, :, :4]
+    weight = np.zeros(random.shape)
+    np.put_along_axis(weight, four, 1.0, axis=2)
+
+    def agreeing(weight: Array, limit: float) -> Array:
+        """(B, trials, C) corners that agree with the homography from those of some weight."""
+        trials = weight.shape[1]
+        x, y, p, q = (np.repeat(z, trials, axis=0) for z in (block.x, block.y, a, b))
+        H = _homography(x, y, p, q, weight.reshape(-1, weight.shape[2]))
+        seen = H @ np.stack([x, y, np.ones_like(x)], axis=1)
+        depth = np.where(np.abs(seen[:, 2]) < 1e-12, 1e-12, seen[:, 2])
+        error = np.hypot(
+            (seen[:, 0] / depth - p) * camera.intrinsics[0], (seen[:, 1] / depth - q) * camera.intrinsics[1]
+        )
+        return (error < limit).reshape(weight.shape) & usable[:, None]
+
+    found = agreeing(weight, _AGREEING[0])
+    best = found[np.arange(len(chosen)), found.sum(axis=2).argmax(axis=1)]
+    for _ in range(3):
+        best = agreeing(best[:, None].astype(np.float64), _AGREEING[1])[:, 0]
+    share = best.sum(axis=1) / usable.sum(axis=1).clip(1)
+    return torch.from_numpy(block.rows[usable & ~best]), torch.from_numpy(share)
 
 
 class _Block(NamedTuple):

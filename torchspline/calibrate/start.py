@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.calibrate.board import FEWEST, MISFIT, BoardPoses, board_poses
+from torchspline.calibrate.board import FEWEST, MISFIT, BoardPoses, board_poses, contradictions
 from torchspline.calibrate.recording import Corners, Recording
 from torchspline.fit import Alignment, align_imu, fit_poses
 from torchspline.groups.group import SE3
+from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
 
@@ -22,6 +23,9 @@ Array = NDArray[Any]
 _NS = 1_000_000_000
 #: Fewest images with a board pose, and the largest share of images with corners that may contradict the board.
 _FEWEST_IMAGES, _MOST_MISFITS = 20, 0.3
+#: Of the latter so many are looked at closely: a good part of an image's corners have to agree before others are
+#: blamed, and of a tag's corners such a part has to be off before the tag is named.
+_LOOKED_AT, _AGREEING, _MISLABELLED = 12, 0.3, 0.75
 #: Knots of the first spline: this many image intervals apart, at least so many seconds.
 _KNOT_INTERVALS, _SHORTEST_KNOT = 2.0, 0.05
 _ORDER = 6
@@ -144,11 +148,12 @@ def _check_images(recording: Recording, i: int, board: BoardPoses, swapped: str)
     wrong = torch.nonzero(board.reason == 3).flatten()
     good = int(board.good.sum())
     if len(wrong) > _MOST_MISFITS * max(int(looked.sum()), 1):
+        camera = recording.cameras[i]
         fits = f", that of the others {float(board.rms[board.good].median()):.2f} px" if good else ""
         raise ValueError(
             f"{where}: expected corners of one flat board seen through the intrinsics given, but {len(wrong)} of "
             f"{int(looked.sum())} images have reprojection errors above {MISFIT:g} px RMS, images {_ranges(wrong)}; "
-            f"their median is {float(board.rms[wrong].median()):.1f} px{fits}. {_suspect(corners, board, wrong)}"
+            f"their median is {float(board.rms[wrong].median()):.1f} px{fits}. {_suspect(camera, corners, wrong)}"
             f"{f' {swapped}' if swapped else ''}"
         )
     if good < _FEWEST_IMAGES:
@@ -166,21 +171,23 @@ def _ranges(rows: Tensor) -> str:
     return ", ".join(words[:6]) + (f" and {len(words) - 6} more stretches" if len(words) > 6 else "")
 
 
-def _suspect(corners: Corners, board: BoardPoses, wrong: Tensor) -> str:
-    """What may be wrong: some tags, where they stand out among the errors of bad images, or everything."""
-    bad = torch.zeros(len(board.t_ns), dtype=torch.bool)
-    bad[wrong] = True
-    rows = bad[corners.frame]
-    length, tags = board.error[rows].norm(dim=1).numpy(), corners.tag_id[rows].numpy()
-    names, which = np.unique(tags, return_inverse=True)
-    medians = np.array([np.median(length[which == i]) for i in range(len(names))])
-    outstanding = names[medians > 3.0 * max(float(np.median(medians)), MISFIT)]
-    if 0 < len(outstanding) <= len(names) / 3:
-        return f"The errors of tags {', '.join(map(str, outstanding))} stand out: are they mislabelled?"
-    return (
-        "No tags stand out: are tags or corners mislabelled throughout, is it another board, or are the intrinsics "
-        "those of another camera?"
-    )
+def _suspect(camera: Camera, corners: Corners, wrong: Tensor) -> str:
+    """What may be wrong in these images: some tags, single corners, or everything."""
+    looked = wrong[torch.linspace(0, len(wrong) - 1, min(_LOOKED_AT, len(wrong))).long()]
+    rows, agreeing = contradictions(camera, corners, looked)
+    if float(agreeing.median()) < _AGREEING:
+        return (
+            "Hardly any corners of an image agree on where the board is: are they mislabelled throughout, is it "
+            "another board, or are the intrinsics those of another camera?"
+        )
+    seen = corners.tag_id[torch.isin(corners.frame, looked)]
+    names, counts = seen.unique(return_counts=True)
+    off = torch.stack([(corners.tag_id[rows] == name).sum() for name in names]) / counts
+    tags = names[off > _MISLABELLED].tolist()
+    share = f"{1.0 - float(agreeing.mean()):.0%} of the corners contradict the rest of their image"
+    if tags and len(tags) < 0.8 * len(names):
+        return f"{share}, above all those of tags {', '.join(map(str, tags))}: are they mislabelled?"
+    return f"{share}, all over the board: are they mislabelled?"
 
 
 def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
