@@ -263,14 +263,31 @@ def test_half_the_images_mislabelled(recording):
     assert "images 100-199" in message
 
 
-def test_two_mislabelled_tags_are_named(recording):
-    corners = recording.corners[0]
+def moved(corners: Corners, tags: dict[int, int]) -> Corners:
+    """Tags taken for others of the board of 6 x 6."""
     xyz = corners.xyz.clone()
-    for tag, other in ((14, 21), (21, 14)):
+    for tag, other in tags.items():
         delta = torch.tensor([(other % 6 - tag % 6) * 0.1144, (other // 6 - tag // 6) * 0.1144, 0.0])
         xyz[corners.tag_id == tag] += delta.double()
-    message = message_of(with_first(recording, replace(corners, xyz=xyz)))
-    assert "above all those of tags 14, 21: are they mislabelled?" in message
+    return replace(corners, xyz=xyz)
+
+
+def test_two_mislabelled_tags_are_named(recording):
+    """Too few to spoil a pose."""
+    some = with_first(recording, moved(recording.corners[0], {14: 21, 21: 14})).only(0)
+    (note,) = find_start(some).notes
+    assert "more than 5 px off, above all those of tags 14, 21" in note
+
+
+def test_many_mislabelled_tags_are_named(recording):
+    """In disorder: if all were moved alike, it would be a pose."""
+    wrong = {tag: (7 * tag + 4) % 19 for tag in range(19)}
+    message = message_of(with_first(recording, moved(recording.corners[0], wrong)))
+    named = re.search(r"above all those of tags ([\d, ]*): are they mislabelled", message)
+    assert named
+    tags = {int(x) for x in named.group(1).split(",")}
+    assert tags <= set(wrong)
+    assert len(tags) >= 10
 
 
 def test_all_corners_mislabelled(recording):

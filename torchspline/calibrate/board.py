@@ -29,8 +29,8 @@ FEWEST = 8
 _NARROW = 0.03
 #: Errors beyond (px) count linearly only [Huber], so that single wrong corners do not pull a pose away.
 _OUTLIER = 2.0
-#: Root mean square (px) above which an image does not show this board through this camera.
-MISFIT = 5.0
+#: An image does not show this board through this camera where more than a share of its corners is farther off (px).
+MISFIT, _WRONG = 5.0, 0.2
 #: A corner behind the camera counts as an error of this many pixels.
 _HIDDEN = 1e4
 _ITERATIONS = 30
@@ -42,7 +42,12 @@ _MODELS: dict[str, Any] = {"radtan": ReprojectionRadtan, "equidistant": Reprojec
 #: Trials to find corners that agree, and errors (px) up to which they do, at first and in the end.
 _TRIALS, _AGREEING = 80, (8.0, MISFIT)
 #: Why an image has no pose.
-REASONS = ("", f"fewer than {FEWEST} corners", "corners on a line", f"more than {MISFIT:g} px RMS")
+REASONS = (
+    "",
+    f"fewer than {FEWEST} corners",
+    "corners on a line",
+    f"too many corners off by more than {MISFIT:g} px",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +113,8 @@ def board_poses(camera: Camera, corners: Corners) -> BoardPoses:
         rms[images] = np.sqrt((residual**2).sum(axis=(0, 2)) / counts[images])
         error[block.rows[block.there]] = residual[:, block.there].T
     pose[:, 3:] = SO3.from_matrix(torch.from_numpy(rotation)).numpy()
-    reason[rms > MISFIT] = 3
+    far = np.bincount(corners.frame.numpy(), np.hypot(*error.T) > MISFIT, len(counts))
+    reason[(reason == 0) & (far > _WRONG * counts)] = 3
     pose[reason != 0] = math.nan
     notes = [
         f"{camera.name}: {count} of {len(counts)} images have no board pose: {REASONS[why]}"

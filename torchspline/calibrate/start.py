@@ -23,9 +23,11 @@ Array = NDArray[Any]
 _NS = 1_000_000_000
 #: Fewest images with a board pose, and the largest share of images with corners that may contradict the board.
 _FEWEST_IMAGES, _MOST_MISFITS = 20, 0.3
+#: Share of corners far off in good images that is worth a note.
+_SPOILED = 0.002
 #: Of the latter so many are looked at closely: a good part of an image's corners have to agree before others are
 #: blamed, and of a tag's corners such a part has to be off before the tag is named.
-_LOOKED_AT, _AGREEING, _MISLABELLED = 12, 0.3, 0.75
+_LOOKED_AT, _AGREEING, _MISLABELLED, _MOST_TAGS = 12, 0.3, 0.75, 0.8
 #: Knots of the first spline: this many image intervals apart, at least so many seconds.
 _KNOT_INTERVALS, _SHORTEST_KNOT = 2.0, 0.05
 _ORDER = 6
@@ -101,7 +103,7 @@ def find_start(recording: Recording, *, max_offset: float | None = 10.0) -> Star
     notes = [note for board in boards for note in board.notes]
     swapped = _swapped(recording, boards)
     for i, board in enumerate(boards):
-        _check_images(recording, i, board, swapped)
+        _check_images(recording, i, board, swapped, notes)
     notes += [swapped] if swapped else []
     splines = [_spline(recording, i, board, notes) for i, board in enumerate(boards)]
     aligned = [_aligned(recording, i, 0, spline, max_offset, notes) for i, spline in enumerate(splines)]
@@ -140,7 +142,7 @@ def _known(x: Tensor | None) -> Tensor:
 # ---------------------------------------------------------------------- images
 
 
-def _check_images(recording: Recording, i: int, board: BoardPoses, swapped: str) -> None:
+def _check_images(recording: Recording, i: int, board: BoardPoses, swapped: str, notes: list[str]) -> None:
     """Enough of them, and not too many that contradict the board."""
     corners, name = recording.corners[i], recording.cameras[i].name
     where = f"{corners.source or f'corners[{i}]'} ({name})"
@@ -152,9 +154,18 @@ def _check_images(recording: Recording, i: int, board: BoardPoses, swapped: str)
         fits = f", that of the others {float(board.rms[board.good].median()):.2f} px" if good else ""
         raise ValueError(
             f"{where}: expected corners of one flat board seen through the intrinsics given, but {len(wrong)} of "
-            f"{int(looked.sum())} images have reprojection errors above {MISFIT:g} px RMS, images {_ranges(wrong)}; "
-            f"their median is {float(board.rms[wrong].median()):.1f} px{fits}. {_suspect(camera, corners, wrong)}"
+            f"{int(looked.sum())} images have many corners off by more than {MISFIT:g} px, images {_ranges(wrong)}; "
+            f"the median of their RMS is {float(board.rms[wrong].median()):.1f} px{fits}. "
+            f"{_suspect(camera, corners, wrong)}"
             f"{f' {swapped}' if swapped else ''}"
+        )
+    shown = board.good[corners.frame]
+    off = shown & (board.error.norm(dim=1) > MISFIT)
+    if int(off.sum()) > _SPOILED * int(shown.sum()):
+        share = float(off.sum()) / float(shown.sum())
+        notes.append(
+            f"{name}: {int(off.sum())} corners ({share:.1%}) are more than {MISFIT:g} px off"
+            f"{_blamed(corners.tag_id[shown], corners.tag_id[off])}"
         )
     if good < _FEWEST_IMAGES:
         raise ValueError(
@@ -180,14 +191,17 @@ def _suspect(camera: Camera, corners: Corners, wrong: Tensor) -> str:
             "Hardly any corners of an image agree on where the board is: are they mislabelled throughout, is it "
             "another board, or are the intrinsics those of another camera?"
         )
-    seen = corners.tag_id[torch.isin(corners.frame, looked)]
-    names, counts = seen.unique(return_counts=True)
-    off = torch.stack([(corners.tag_id[rows] == name).sum() for name in names]) / counts
-    tags = names[off > _MISLABELLED].tolist()
     share = f"{1.0 - float(agreeing.mean()):.0%} of the corners contradict the rest of their image"
-    if tags and len(tags) < 0.8 * len(names):
-        return f"{share}, above all those of tags {', '.join(map(str, tags))}: are they mislabelled?"
-    return f"{share}, all over the board: are they mislabelled?"
+    blamed = _blamed(corners.tag_id[torch.isin(corners.frame, looked)], corners.tag_id[rows])
+    return f"{share}{blamed or ', all over the board'}: are they mislabelled?"
+
+
+def _blamed(seen: Tensor, off: Tensor) -> str:
+    """In words, tags most of whose corners are off, unless those are almost all there are."""
+    names, counts = seen.unique(return_counts=True)
+    tags = names[torch.stack([(off == name).sum() for name in names]) > _MISLABELLED * counts].tolist()
+    few = 0 < len(tags) < _MOST_TAGS * len(names)
+    return f", above all those of tags {', '.join(map(str, tags))}" if few else ""
 
 
 def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
@@ -234,7 +248,7 @@ def _spline(recording: Recording, i: int, board: BoardPoses, notes: list[str]) -
     dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / _NS, _SHORTEST_KNOT)
 
     def fit(t: Tensor, poses: Tensor) -> Any:
-        options = {"smoothness": _SMOOTHNESS, "max_iterations": 10, "tolerance": 1e-4}
+        options: dict[str, Any] = {"smoothness": _SMOOTHNESS, "max_iterations": 10, "tolerance": 1e-4}
         return fit_poses(t, poses, dt=dt, order=_ORDER, progress=False, **options)
 
     found = fit(t, poses)
