@@ -13,8 +13,6 @@ from calibration import real, simulation
 from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
 
-REPRESENTATIONS = ["split", "joint"]
-
 
 def real_tables(figures: dict[str, Any]) -> list[Table]:
     seconds = figures["seconds"]
@@ -66,7 +64,8 @@ def simulated_tables(
         x = x[:3] if name.startswith("t_") else x[3:] if name.startswith("R_") else x
         return float(x.norm()) * (9.80665 if name == "g" else 1.0)
 
-    apart = simulation.deviations(full["estimates"]["split"], full["estimates"]["joint"])
+    solved = list(full["estimates"].values())
+    apart = simulation.deviations(solved[0], solved[-1])
     second = Table(
         f"[S20] Table 2: largest difference between the mean and the estimates of all six variants ({share:g} of the "
         "recording), of variants of one spline, and of split and joint on all of it",
@@ -129,6 +128,7 @@ def experiment(
     threads: int,
     order: int,
     spacing: float,
+    representations: list[str],
     seconds: float,
     images: int,
     samples: int,
@@ -145,7 +145,7 @@ def experiment(
         real_seconds: how much of it.
         repeats: solutions of which the fastest counts.
         threads: for the real recording; simulated ones have one, as in the paper.
-        order, spacing: of the splines.
+        order, spacing: of the splines. representations: of the simulated recording, split first.
         seconds, images, samples, corners: of the simulated recording; images of each of two cameras.
         cut: share of it on which product rule and automatic Jacobians are tried.
         draws: of noise, for the normalised estimation error; draw_seconds: how long those recordings are.
@@ -165,17 +165,17 @@ def experiment(
         "corners": corners,
         "distortion": "equidistant",
     }
-    full = simulation.full_size(size, REPRESENTATIONS, order, spacing, repeats, seed)
+    full = simulation.full_size(size, representations, order, spacing, repeats, seed)
     smaller = {
         key: max(round(x * cut), 1) if isinstance(x, int) else x
         for key, x in size.items()
         if key != "seconds"
     }
     times, found = simulation.variants(
-        {**smaller, "seconds": seconds * cut}, REPRESENTATIONS, order, spacing, seed
+        {**smaller, "seconds": seconds * cut}, representations, order, spacing, seed
     )
     table2 = simulation.largest_from_mean(list(found.values()))
-    groups = [[x for (spline, _), x in found.items() if spline == r] for r in REPRESENTATIONS]
+    groups = [[x for (spline, _), x in found.items() if spline == r] for r in representations]
     each = [simulation.largest_from_mean(group) for group in groups]
     same = {name: max(x[name] for x in each) for name in table2}
     tables += simulated_tables(full, times, table2, same, cut)
@@ -202,6 +202,6 @@ if __name__ == "__main__":
         experiment,
         smoke={
             "real_seconds": 15.0, "repeats": 0, "seconds": 2.0, "images": 20, "samples": 400, "corners": 1000,
-            "cut": 0.5, "draws": 3, "draw_seconds": 2.0, "spacing": 0.05,
+            "cut": 0.5, "draws": 3, "draw_seconds": 2.0, "spacing": 0.05, "representations": ["split"],
         },
     )  # fmt: skip

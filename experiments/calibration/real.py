@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchspline.calibrate import Camera, Recording, Start, board_poses, find_start, read_recording
+from torchspline.calibrate import Camera, Recording, board_poses, find_start, read_recording
 from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.groups import SE3, SO3
 
@@ -81,12 +81,12 @@ def apart(a: Tensor, b: Tensor) -> tuple[float, float]:
     return float(difference[:3].norm()), float(SO3.log(difference[3:]).norm() * DEGREES)
 
 
-def halves(recording: Recording, start: Start, **options: Any) -> dict[str, Any]:
-    """Differences of the two halves over the deviations of these, largest of each kind of estimate."""
+def halves(recording: Recording, **options: Any) -> dict[str, Any]:
+    """Differences of two halves, each solved from nothing, over their deviations; the largest of each estimate."""
     last = max(int(c.t_ns[-1]) for c in recording.corners)
     middle = 0.5e-9 * (last - recording.start_ns)
     parts = [recording.between(0.0, middle), recording.between(middle, 2 * middle + 1.0)]
-    a, b = (calibrate(part, _cut(start, part), **options) for part in parts)
+    a, b = (calibrate(part, **options) for part in parts)
     found: dict[str, Any] = {}
     for i, (x, y) in enumerate(zip(a.cameras, b.cameras, strict=True)):
         error = SE3.log(SE3.between(x.T_imu_cam, y.T_imu_cam))
@@ -109,14 +109,6 @@ def halves(recording: Recording, start: Start, **options: Any) -> dict[str, Any]
 
 def _worst(error: Tensor, sigma: Tensor) -> float:
     return float((error / sigma).abs().max())
-
-
-def _cut(start: Start, part: Recording) -> Start:
-    """The start of the whole recording for a part of it."""
-    low = min(int(c.t_ns[0]) for c in part.corners)
-    high = max(int(c.t_ns[-1]) for c in part.corners)
-    inside = (start.t_ns >= low) & (start.t_ns <= high)
-    return replace(start, t_ns=start.t_ns[inside], T_board_imu=start.T_board_imu[inside])
 
 
 def everything(folder: Path, seconds: float | None, repeats: int, options: dict[str, Any]) -> dict[str, Any]:
@@ -146,9 +138,9 @@ def everything(folder: Path, seconds: float | None, repeats: int, options: dict[
             "fisheye of both": one_by_one(known, settled, **options),
         },
         "halves": {
-            "given intrinsics": halves(recording, start, **options),
-            "given intrinsics, independent errors": halves(recording, start, **{**options, "stretch": None}),
-            "fisheye of both": halves(known, start, **options),
+            "given intrinsics": halves(recording, **options),
+            "given intrinsics, independent errors": halves(recording, **{**options, "stretch": None}),
+            "fisheye of both": halves(known, **options),
         },
         "estimates": {name: _summary(found) for name, found in (("given", given), ("fisheye", settled))},
     }  # fmt: skip
