@@ -2,12 +2,12 @@
 
 A network (`learning/estimator.py`) that has seen nothing but generated motions and sensors is given gyroscope and
 accelerometer of a real recording. With the biases and scales that it finds, readings are corrected through the sensor
-model and the gyroscope is integrated; poses serve to measure errors, of 1 s, 5 s and 10 s and of the whole run from
-its first pose on, and for nothing else. Compared with: no correction; the mean of the stillest second among the first
-20 as bias (the usual practice, which needs a rest); the same least squares without a network and training; and the
-constant bias that the poses themselves tell, about the most that can be had. Poses of EuRoC come from a fusion that
-used the same IMU, those of TUM VI from motion capture. No parameter was trained on these recordings, but they were
-looked at while motions, sensors and the network were chosen.
+model and the gyroscope is integrated; poses serve to measure errors, of 1 s, 5 s and 10 s and of the whole run from its
+first pose on, and for nothing else. Compared with: no correction; the mean of the stillest second among the first 20 as
+bias (the usual practice, which needs a rest); the same least squares without a network and training; and the constant
+bias that the poses themselves tell, about the most that can be had. Poses of EuRoC come from a fusion that used the
+same IMU, those of TUM VI from motion capture. No parameter was trained on these recordings, but
+they were looked at while motions, sensors and the network were chosen.
 """
 
 import tempfile

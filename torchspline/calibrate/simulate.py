@@ -104,8 +104,8 @@ def simulate(
 
     imu = ImuRecord(
         stamps,
-        noisy(clean.gyroscope, noise.gyroscope_noise_density * rate),
-        noisy(clean.accelerometer, noise.accelerometer_noise_density * rate),
+        noisy(clean.gyroscope, float(noise.gyroscope_noise_density) * rate),
+        noisy(clean.accelerometer, float(noise.accelerometer_noise_density) * rate),
         source="simulated",
     )
     # Images keep away from the ends by more than the offsets, so that none of them leaves the trajectory.
