@@ -201,7 +201,7 @@ if __name__ == "__main__":
     run(
         experiment,
         smoke={
-            "real_seconds": 15.0, "repeats": 0, "seconds": 2.0, "images": 20, "samples": 400, "corners": 1000,
-            "cut": 0.5, "draws": 3, "draw_seconds": 2.0, "spacing": 0.05, "representations": ["split"],
+            "real_seconds": 12.0, "repeats": 0, "seconds": 4.0, "images": 20, "samples": 500, "corners": 600,
+            "cut": 0.75, "draws": 3, "draw_seconds": 2.0, "spacing": 0.05, "representations": ["split"],
         },
     )  # fmt: skip

@@ -185,8 +185,11 @@ def gyroscopes(group: str = "R3xSO3", count: int = 60) -> Problem:
     return problem
 
 
-def test_redundancies_are_traces():
+@pytest.mark.parametrize("sparse", [False, True])
+def test_redundancies_are_traces(sparse, monkeypatch):
     """Each that of a dense matrix; together what is left when unknowns are taken off."""
+    if sparse:  # whatever is wider than nothing goes there
+        monkeypatch.setattr("torchspline.fit.problem._WIDEST_BAND", 0)
     problem = gyroscopes()
     result = problem.solve(max_iterations=3)
     linearizer, state = result._linearizer, result._state
@@ -198,6 +201,11 @@ def test_redundancies_are_traces():
     for found, matrix, numbers in zip(result.redundancy.values(), dense_ones, (180, 60), strict=True):
         assert found == pytest.approx(numbers - np.trace(inverse @ matrix), rel=1e-9)
     assert sum(result.redundancy.values()) == pytest.approx(240 - total, rel=1e-9)
+    assert np.allclose(result._factor.diagonal(), np.diagonal(inverse), rtol=1e-9)
+    assert result.banded is not sparse
+    if sparse:
+        with pytest.raises(ValueError, match=r"stretch: .*narrow border"):
+            result.standard_deviation(problem.variables["bias"], stretch=0.1)
 
 
 def test_scatter_of_stretches():
