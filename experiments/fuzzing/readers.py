@@ -13,6 +13,8 @@ import torch
 import torchspline as ts
 from fuzzing.watch import Sample
 from torchspline import io
+from torchspline.calibrate import read_corners, read_recording
+from torchspline.generate import Recipe
 from torchspline.robot import Robot
 
 _STAMP, _STEP = 1_520_530_308_189_679_351, 5_000_000
@@ -76,10 +78,10 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
             ],
         ),
         "read_bvh": Reader(io.read_bvh, [Sample("walk.bvh", _BVH), packed(Sample("walk.bvh", _BVH))]),
+        "Recipe.load": Reader(Recipe.load, [Sample("recipe.yaml", _RECIPE)]),
         "Robot.from_urdf": Reader(Robot.from_urdf, [Sample("arm.urdf", _URDF)]),
     }
-    if find_spec("torchspline.calibrate"):
-        found |= _calibration(folder, samples)
+    found |= _calibration(folder, samples)
     return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
 
 
@@ -104,8 +106,6 @@ def _trajectories(written: Callable[..., Sample]) -> list[Sample]:
 
 
 def _calibration(folder: Path, samples: Sample) -> dict[str, Reader]:
-    from torchspline.calibrate import read_corners, read_recording
-
     count = 24
     tag, corner = np.divmod(np.arange(count), 4)
     right, up = np.isin(corner, (1, 2)), corner >= 2
@@ -256,4 +256,20 @@ cam0:
   distortion_model: radtan
   intrinsics: [400, 401.5, 320, 240]
   distortion_coeffs: [-0.2, 0.1, 1e-4, 0.0]
+"""
+
+_RECIPE = b"""recipe:
+  duration: 10.0
+  rate: 200.0
+  rest: {choice: [0.0, 1.0]}
+  mounting: random
+  dtype: float32
+  motions:
+    smooth:
+      weight: 2.0
+      bandwidth: {log_uniform: [0.3, 3.0]}
+    drone: {acceleration: {uniform: [0.3, 3.0]}}
+  sensor:
+    gyroscope_bias: {normal: [0.0, 0.02]}
+    gyroscope_range: 35.0
 """
