@@ -79,7 +79,13 @@ def cases() -> Iterator[Case]:
         yield refused(function, "path", "option", nowhere, "does not exist", "make it first", named=nowhere)
     text = file("words", "words.npz")
     yield refused(
-        "load_trajectory", "path", "option", text, "got a damaged or truncated file", "an npz archive", named=text
+        "load_trajectory",
+        "path",
+        "option",
+        text,
+        "got a damaged or truncated file",
+        "an npz archive",
+        named=text,
     )
     yield refused("read_nerfstudio", "path", "option", text, "Expecting value", "expected JSON", named=text)
     for bad in ("a", True, 1j):

@@ -193,7 +193,9 @@ def test_archives_that_are_no_trajectory(tmp_path):
     whole = with_header(tmp_path).read_bytes()
     for cut in (0, 10, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match=r"x.npz: expected an npz archive of numbers, got a damaged or truncated file"):
+        with pytest.raises(
+            ValueError, match=r"x.npz: expected an npz archive of .*, got a damaged or truncated file"
+        ):
             load_trajectory(path)
     flipped = bytearray(whole)
     flipped[len(whole) // 3] ^= 1

@@ -12,9 +12,9 @@ import torch
 
 import torchspline as ts
 from fuzzing.watch import Sample
-from torchspline import io
+from torchspline import generate, io
 from torchspline.calibrate import read_corners, read_recording
-from torchspline.generate import Recipe
+from torchspline.generate.shards import MANIFEST
 from torchspline.robot import Robot
 
 _STAMP, _STEP = 1_520_530_308_189_679_351, 5_000_000
@@ -78,10 +78,12 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
             ],
         ),
         "read_bvh": Reader(io.read_bvh, [Sample("walk.bvh", _BVH), packed(Sample("walk.bvh", _BVH))]),
-        "Recipe.load": Reader(Recipe.load, [Sample("recipe.yaml", _RECIPE)]),
+        "Recipe.load": Reader(generate.Recipe.load, [Sample("recipe.yaml", _RECIPE)]),
         "Robot.from_urdf": Reader(Robot.from_urdf, [Sample("arm.urdf", _URDF)]),
     }
     found |= _calibration(folder, samples)
+    if find_spec("pyarrow"):
+        found |= _data_sets(folder)
     return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
 
 
@@ -135,6 +137,23 @@ def _calibration(folder: Path, samples: Sample) -> dict[str, Reader]:
         ),
         "read_corners": Reader(read_corners, [corners]),
         "read_recording": Reader(recording, [Sample("config.yaml", _CONFIG, beside)]),
+    }
+
+
+def _data_sets(folder: Path) -> dict[str, Reader]:
+    recipe = generate.Recipe({"smooth": {}}, duration=0.5, rate=20.0, knot_spacing=0.03)
+    generate.write(recipe, folder / "set", seed=0, items=2)
+    (shard,) = (folder / "set").glob("*.parquet")
+    manifest = folder / "set" / MANIFEST
+    names = ((shard.name, shard.read_bytes()), (manifest.name, manifest.read_bytes()))
+
+    def read(path: Path) -> Any:
+        items = generate.read(path.parent)
+        return [items[i] for i in range(min(len(items), 100))]
+
+    return {
+        "generate.read, manifest": Reader(read, [Sample(*names[1], beside=names[:1])]),
+        "generate.read, shard": Reader(read, [Sample(*names[0], beside=names[1:])]),
     }
 
 

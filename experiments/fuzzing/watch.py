@@ -155,7 +155,7 @@ def _try(read: Callable[[Path], Any], path: Path, index: int) -> tuple[str, list
         read(path)
     except DOCUMENTED as error:
         message = str(error)
-        if "\n" in message or path.name not in message or len(message) > 2000:
+        if "\n" in message or str(path.parent) not in message or len(message) > 2000:
             return "refused", [Finding("message", index, f"{type(error).__name__}: {message[:300]!r}")]
         return "refused", []
     except MemoryError as error:
