@@ -163,9 +163,9 @@ def _check_board(path: Path, target: Any, corners: Corners) -> None:
     if missing:
         raise ValueError(f"{path}: calib_target: {missing[0]}: expected a number, got none")
     rows, columns, size, spacing = (number(f"{path}: calib_target: {x}", target[x]) for x in names)
-    for name, x in zip(names, (rows, columns, size, spacing), strict=True):
-        if not (math.isfinite(x) and x >= (1 if name in names[:2] else 0)):
-            raise ValueError(f"{path}: calib_target: {name}: expected the size of a board, got {x:g}")
+    for name, given in zip(names, (rows, columns, size, spacing), strict=True):
+        if not (math.isfinite(given) and given >= (1 if name in names[:2] else 0)):
+            raise ValueError(f"{path}: calib_target: {name}: expected the size of a board, got {given:g}")
     if len(corners) == 0:
         return
     stray = (corners.tag_id < 0) | (corners.tag_id >= rows * columns)
