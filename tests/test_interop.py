@@ -76,6 +76,10 @@ TRAJECTORIES = {
     "options": lambda: ts.KeyframeSpline(
         "composite_bezier", points(6, ts.SO3), torch.arange(6.0, dtype=F64), group=ts.SO3, ends="clamped"
     ),
+    "knots in nanoseconds": lambda: ts.NonuniformBSpline(
+        points(6), group=ts.SE3, order=3, knots=STAMP + 10**8 * torch.arange(9)
+    ),
+    "keys in nanoseconds": lambda: ts.KeyframeSpline("SE3Up", points(6), STAMP + 10**8 * torch.arange(6)),
     "Mounted": lambda: hermite().mounted(points(1, seed=5)[0]).mounted(nn.Parameter(points(1, seed=6)[0])),
 }
 
