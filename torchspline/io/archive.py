@@ -96,6 +96,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise ValueError(
                     f"{len(members)} arrays of {total} bytes in {stored}, more than such a file can hold"
                 )
+            if sum(info.compress_size for info in members) > stored:  # reserved before it is read
+                raise ValueError(f"arrays that are longer than the file of {stored} bytes")
             return {info.filename.removesuffix(".npy"): _array(archive, info) for info in members}
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
