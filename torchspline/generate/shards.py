@@ -153,15 +153,16 @@ class ShardedDataset(Dataset):
         parquet = pyarrow().parquet
         shard = index // self.manifest["items_per_shard"]
         first = shard * self.manifest["items_per_shard"]
-        with parquet.ParquetFile(self.files[shard], page_checksum_verification=True) as file:
-            group = 0
-            while index >= first + (size := file.metadata.row_group(group).num_rows):
-                first, group = first + size, group + 1
-            try:
+        try:
+            with parquet.ParquetFile(self.files[shard], page_checksum_verification=True) as file:
+                group = 0
+                while index >= first + (size := file.metadata.row_group(group).num_rows):
+                    first, group = first + size, group + 1
                 table = file.read_row_group(group)
-            except (OSError, pyarrow().ArrowException) as error:
-                raise ValueError(f"folder: {self.files[shard]} is damaged: {short(error)}") from None
-        return first, first + size, {name: _column(table[name]) for name in table.column_names}
+            columns = {name: _column(table[name]) for name in table.column_names}
+        except (OSError, TypeError, ValueError, LookupError, pyarrow().ArrowException) as error:
+            raise ValueError(f"folder: {self.files[shard]} is damaged: {short(error)}") from None
+        return first, first + size, columns
 
 
 def pyarrow() -> Any:
