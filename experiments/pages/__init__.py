@@ -1,8 +1,7 @@
 """The code in the pages of the documentation: found, run, and compared with what the pages show.
 
-The Python blocks of a page run in order in one namespace. A block of text right behind one is what it prints: numbers in
-it agree to the digits that are shown, or nearly (see `same_output`). A block may be marked as no example to run by a
-language other than `python`.
+The Python blocks of a page run in order in one namespace. A block of text right behind one is what it prints: its
+numbers agree to the digits that are shown, or nearly (see `same_output`). Blocks in other languages do not run.
 """
 
 import contextlib
@@ -40,9 +39,7 @@ def blocks(page: Path) -> list[Block]:
 
 def images(page: Path) -> list[Path]:
     """The pictures a page shows."""
-    return [
-        (page.parent / name).resolve() for name in _IMAGE.findall(page.read_text(encoding="utf-8"))
-    ]
+    return [(page.parent / name).resolve() for name in _IMAGE.findall(page.read_text(encoding="utf-8"))]
 
 
 def run_page(page: Path) -> Iterator[tuple[Block, str, dict]]:
