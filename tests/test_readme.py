@@ -10,14 +10,15 @@ README = Path(__file__).resolve().parent.parent / "README.md"
 
 def test_readme_code_runs() -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     torch.manual_seed(0)
     names: dict = {}
-    for code in blocks:  # the second goes on where the first ended
+    for code in blocks:  # each goes on where the one before ended
         exec(code, names)
     assert names["gyroscope"].shape == (100, 3)
     assert torch.isfinite(names["loss"])
     assert names["result"].converged
+    assert names["corrected"].gyroscope.shape == (100, 3)
 
 
 def test_readme_names_the_two_commands() -> None:

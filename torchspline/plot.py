@@ -1,13 +1,15 @@
 """Figures. Matplotlib is imported when one is drawn, and draws without a screen."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.imu import ImuReading
+from torchspline.imu import AllanDeviation, ImuReading, NoiseEstimate
+from torchspline.imu.allan import allan_variance
 
 _AXES = ("x", "y", "z")
 
@@ -59,6 +61,58 @@ def imu_comparison(
         loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=6, fontsize=8, frameon=False, markerscale=2
     )
     figure.savefig(path, dpi=130)
+
+
+def allan(
+    path: str | Path,
+    deviations: Mapping[str, AllanDeviation],
+    fits: Mapping[str, NoiseEstimate] | None = None,
+    unit: str = "",
+    title: str = "",
+) -> None:
+    """Allan deviations over cluster time with their 95 % bounds, and fits as dashed lines; written to `path`.
+
+    Args:
+        deviations: of records (N, C) or batches of them, by name; every channel is a line.
+        fits: what `imu.fit_noise` found in those of the same names.
+        unit: of the records.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    allan_panel(axes, deviations, fits)
+    axes.set_xlabel("cluster time [s]")
+    axes.set_ylabel(f"Allan deviation [{unit}]" if unit else "Allan deviation")
+    axes.set_title(title)
+    figure.savefig(path, dpi=130)
+
+
+def allan_panel(
+    axes: Any, deviations: Mapping[str, AllanDeviation], fits: Mapping[str, NoiseEstimate] | None = None
+) -> None:
+    """The same on `axes` of Matplotlib, without titles."""
+    for i, (name, found) in enumerate(deviations.items()):
+        checks.instance(f"deviations[{name!r}]", found, AllanDeviation, "an AllanDeviation")
+        tau = _numbers(found.tau)
+        curves, lower, upper = (
+            _numbers(x.transpose(-1, -2).flatten(0, -2)) for x in (found.deviation, *found.bounds(0.95))
+        )
+        for j, curve in enumerate(curves):
+            axes.loglog(tau, curve, color=f"C{i}", linewidth=1.2, label=None if j else name)
+            axes.fill_between(tau, lower[j], upper[j], color=f"C{i}", alpha=0.12, linewidth=0)
+        if fits and name in fits:
+            parts = [
+                allan_variance(part, _numbers(found.clusters), found.interval)
+                * _numbers(x.reshape(-1, 1)) ** 2
+                for part, x in fits[name].coefficient.items()
+            ]
+            for curve in sum(parts) ** 0.5:
+                axes.loglog(tau, curve, "--", color=f"C{i}", linewidth=0.8)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
 
 
 def _numbers(x: Tensor):

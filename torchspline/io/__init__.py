@@ -9,11 +9,22 @@ from pathlib import Path
 import torch
 
 from torchspline.io import euroc, kitti, tum
+from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
 from torchspline.io.text import Table, read_table
 
-__all__ = ["ImuRecord", "PoseRecord", "read_imu", "read_poses", "write_imu", "write_poses"]
+__all__ = [
+    "ImuParameters",
+    "ImuRecord",
+    "PoseRecord",
+    "read_imu",
+    "read_imu_parameters",
+    "read_poses",
+    "write_imu",
+    "write_imu_parameters",
+    "write_poses",
+]
 
 _FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in (euroc, kitti, tum)}
 

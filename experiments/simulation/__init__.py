@@ -1,0 +1,1 @@
+"""What the throughput of the sensor model is measured with."""

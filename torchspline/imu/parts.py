@@ -1,0 +1,110 @@
+"""Keeping and checking the parameters that sensors are made of."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchspline import checks
+from torchspline.splines.trajectory import Trajectory
+
+
+def keep(module: nn.Module, name: str, x: Tensor | None) -> None:
+    """A `Parameter` or a tensor that carries a graph as given, any other as a copy that is not learnt."""
+    if isinstance(x, nn.Parameter):
+        module.register_parameter(name, x)
+    else:
+        module.register_buffer(name, x if x is None or x.requires_grad else x.clone())
+
+
+def tensor_of(name: str, x: Any, shape: tuple[int, ...], meaning: str, batched: bool = True) -> Tensor | None:
+    """`x` (a tensor, a number, nested sequences of numbers, None) as a floating tensor (*batch, *shape).
+
+    A number stands for all entries of a vector. Sequences become float64.
+    """
+    if x is None:
+        return None
+    if isinstance(x, Tensor):
+        checks.is_floating_tensor(name, x)
+    else:
+        try:
+            if isinstance(x, bool):
+                raise TypeError
+            x = torch.tensor(x, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"{name}: expected a tensor or numbers, {meaning}, got {x!r}") from None
+    if x.ndim == 0 and len(shape) == 1:
+        x = x.expand(shape)
+    size = len(shape)
+    if tuple(x.shape[x.ndim - size :]) != shape or x.ndim < size or (x.ndim > size and not batched):
+        lead = "(*batch, " if batched else "("
+        numbers = ", ".join(map(str, shape)) + ("," if len(shape) == 1 and not batched else "")
+        raise ValueError(f"{name}: expected shape {lead}{numbers}), {meaning}, got {tuple(x.shape)}")
+    checks.finite(name, x)
+    return x
+
+
+def above_zero(name: str, x: Tensor | None, zero_too: bool = False) -> None:
+    """Every number is positive (or zero)."""
+    if x is None or not checks.values_visible(x):
+        return
+    y = x.detach()
+    good = y >= 0 if zero_too else y > 0
+    if checks.seen_true(good.all()) is False:
+        where = tuple(torch.nonzero(~good)[0].tolist())
+        least = "of at least zero" if zero_too else "above zero"
+        raise ValueError(f"{name}: expected numbers {least}, got {y[where].item():g}")
+
+
+def along_time(x: Tensor, like: Tensor, name: str = "trajectory") -> Tensor:
+    """A parameter (n,) or (*batch, n) as (n,) or (*batch, 1, n), of the dtype of `like`, which errors call `name`."""
+    if x.device != like.device:
+        raise ValueError(
+            f"{name}: on device {like.device}, but the sensor is on {x.device}; move one with .to(device)"
+        )
+    x = x.to(like.dtype)
+    return x if x.ndim == 1 else x.unsqueeze(-2)
+
+
+def bias_of(name: str, x: Any, size: int, unit: str) -> Tensor | Trajectory | None:
+    """A constant bias, or a trajectory in R^size whose value it is."""
+    if isinstance(x, Trajectory):
+        if x.group.name != f"R{size}" and x.group.point_size != size:
+            raise ValueError(f"{name}: expected a trajectory in R{size}, got one in {x.group}")
+        return x
+    return tensor_of(name, x, (size,), f"{unit}, or a trajectory in R{size}")
+
+
+def times_of(t: Tensor, trajectory: Trajectory) -> Tensor:
+    """The stamps, checked as far as sampling needs it before the trajectory sees them."""
+    checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
+    if not isinstance(t, Tensor):
+        raise TypeError(
+            f"t: expected a torch.Tensor, got {type(t).__name__}; convert it with torch.as_tensor"
+        )
+    if t.dtype not in (torch.float32, torch.float64, torch.int64):
+        raise TypeError(
+            "t: expected seconds as torch.float32 or torch.float64, or nanoseconds as torch.int64, "
+            f"got {t.dtype}"
+        )
+    if t.dtype != torch.int64:
+        checks.finite("t", t)
+    return t
+
+
+def mean_rate(t: Tensor) -> float:
+    """Samples per second of a sensor that took its samples at `t`, (..., N)."""
+    if t.shape[-1] < 2:
+        raise ValueError("rate: expected samples per second where there is a single stamp, got None")
+    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64).mean().item()
+    seconds = span * 1e-9 if t.dtype == torch.int64 else span
+    if not seconds > 0:
+        raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
+    return (t.shape[-1] - 1) / seconds
+
+
+def drawing_device(generator: Any, device: torch.device) -> torch.device:
+    """Where random numbers are drawn: where their generators are, so that a CPU's serve a GPU, too."""
+    first = generator[0] if isinstance(generator, Sequence) and len(generator) else generator
+    return first.device if isinstance(first, torch.Generator) else device

@@ -1,0 +1,138 @@
+"""When a sensor really samples: its clock, the jitter of its sampling, the samples that get lost."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchspline import checks
+from torchspline.imu.noise import Generators, white_noise
+from torchspline.imu.parts import above_zero, drawing_device, keep, tensor_of
+from torchspline.splines.trajectory import Trajectory
+
+_NANOSECOND = 1e-9
+
+
+class Instants(NamedTuple):
+    """`t` (N,) or (*batch, N): when samples were taken, in the trajectory's time and unit; `valid`: which arrived."""
+
+    t: Tensor
+    valid: Tensor
+
+
+class Sampling(nn.Module):
+    """How the stamps of a sensor relate to the instants at which it samples a trajectory.
+
+    `stamp = t + offset + skew (t - mid)`, mid the middle of the trajectory's domain, as `fit.Clock` has it; the instant
+    then misses t by jitter that the stamp does not tell, and some samples never arrive.
+
+    Args:
+        time_offset: s, by which stamps are late; a number or (*batch,).
+        time_skew: s/s; a number or (*batch,).
+        jitter: s, standard deviation, independent from sample to sample.
+        drop_probability: of each sample to be lost, independently; at least 0, below 1.
+    """
+
+    time_offset: Tensor | None
+    time_skew: Tensor | None
+    jitter: Tensor | None
+    drop_probability: Tensor | None
+
+    def __init__(
+        self,
+        time_offset: Tensor | float = 0.0,
+        time_skew: Tensor | float = 0.0,
+        jitter: Tensor | float = 0.0,
+        drop_probability: Tensor | float = 0.0,
+    ):
+        super().__init__()
+        given = {
+            "time_offset": time_offset,
+            "time_skew": time_skew,
+            "jitter": jitter,
+            "drop_probability": drop_probability,
+        }
+        for name, x in given.items():
+            if x is None:
+                raise TypeError(f"{name}: expected a number or a tensor (*batch,), got None; 0 means none")
+            # A plain zero is known to have no effect; a tensor may become something else.
+            number = isinstance(x, (int, float)) and not isinstance(x, bool) and x == 0
+            keep(self, name, None if number else tensor_of(name, x, (), "a number or (*batch,)"))
+        for name in ("jitter", "drop_probability"):
+            above_zero(name, getattr(self, name), zero_too=True)
+        for name, kept in (("time_skew", self.time_skew), ("drop_probability", self.drop_probability)):
+            if kept is None or not checks.values_visible(kept):
+                continue
+            largest = kept.detach().abs().amax()
+            if checks.seen_true(largest < 1.0) is False:
+                raise ValueError(f"{name}: expected numbers below 1, got {largest.item():g}")
+
+    def forward(self, trajectory: Trajectory, t: Tensor, generator: Generators = None) -> Instants:
+        """Instants of the samples with stamps `t` (N,) or (*batch, N), seconds or int64 nanoseconds.
+
+        Jitter does not reach beyond a domain whose trajectory refuses times outside.
+        """
+        own = {n: x.shape for n, x in (*self._parameters.items(), *self._buffers.items()) if x is not None}
+        checks.broadcast(t=t.shape[:-1], **own)
+        late: Tensor | None = None
+        seconds = t.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else t.to(torch.float64)
+        if self.time_skew is not None:
+            start, stop = trajectory.domain
+            mid = 0.5 * (start + stop)
+            if t.dtype == torch.int64:  # differences of epochs in whole nanoseconds first
+                since = (t - int(mid)).to(torch.float64) * _NANOSECOND
+            else:
+                since = seconds - mid
+            skew = _column(self.time_skew)
+            offset = 0.0 if self.time_offset is None else _column(self.time_offset)
+            late = since - (since - offset) / (1.0 + skew)
+        elif self.time_offset is not None:
+            late = _column(self.time_offset)
+        at = t if late is None else shifted(t, -late)
+        batch = at.shape[:-1]
+        for x in (self.jitter, self.drop_probability):
+            if x is not None:
+                batch = torch.broadcast_shapes(batch, x.shape)
+        valid = torch.ones((), dtype=torch.bool, device=t.device).expand(at.shape)
+        if self.jitter is None and self.drop_probability is None:
+            return Instants(at, valid)
+        if isinstance(generator, Sequence) and not batch:
+            batch = torch.Size([len(generator)])
+        # Two columns whatever is used, so that one effect does not change the random numbers of another.
+        one = torch.ones((), device=drawing_device(generator, t.device))
+        normals = white_noise((*batch, t.shape[-1], 2), one, one, generator, torch.float32).to(t.device)
+        if self.jitter is not None:
+            at = excursion(trajectory, at, normals[..., 0].to(torch.float64) * _column(self.jitter))
+        if self.drop_probability is not None:
+            # A normal number lies below the quantile with just this probability.
+            valid = normals[..., 1] >= torch.special.ndtri(_column(self.drop_probability))
+        return Instants(at, valid)
+
+
+def _column(x: Tensor) -> Tensor:
+    """(*batch,) to go with (*batch, N), in double precision."""
+    x = x.to(torch.float64)
+    return x if x.ndim == 0 else x.unsqueeze(-1)
+
+
+def shifted(t: Tensor, by: Tensor) -> Tensor:
+    """Times `by` seconds later; nanoseconds stay whole, and therefore pass no gradient."""
+    if t.dtype != torch.int64:
+        return t.to(torch.float64) + by
+    if torch.is_grad_enabled() and by.requires_grad:
+        raise TypeError(
+            "t: expected torch.float64 seconds where time_offset, time_skew or jitter requires grad, got "
+            "torch.int64; whole nanoseconds have no gradient"
+        )
+    return t + (by / _NANOSECOND).round().to(torch.int64)
+
+
+def excursion(trajectory: Trajectory, t: Tensor, by: Tensor) -> Tensor:
+    """Times `by` seconds later, kept inside the domain where t is and where nothing lies beyond."""
+    moved = shifted(t, by)
+    if getattr(trajectory, "extrapolate", "error") != "error":
+        return moved
+    start, stop = trajectory.domain
+    # Where t itself is outside it stays there, for the trajectory to refuse.
+    return torch.minimum(torch.maximum(moved, t.clamp(max=start)), t.clamp(min=stop))
