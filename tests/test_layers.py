@@ -20,7 +20,8 @@ LAYERS = [
     {"splines"},
     {"imu"},
     {"fit"},
-    {"functional", "robot", "io", "plot"},
+    {"functional", "robot", "people", "io", "plot"},
+    {"cli_body"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

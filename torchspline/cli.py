@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `torchspline imu`, `torchspline kernels show`."""
+"""The command line: `torchspline demo`, `torchspline imu`, `torchspline body`, `torchspline kernels show`."""
 
 import json
 import math
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from torchspline.cli_body import body
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.groups import SO3, Group
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
@@ -341,7 +342,7 @@ def main() -> None:
     from jsonargparse import CLI
 
     try:
-        status = CLI({"demo": demo, "imu": imu, "kernels": {"show": show}}, prog="torchspline")
+        status = CLI({"demo": demo, "imu": imu, "body": body, "kernels": {"show": show}}, prog="torchspline")
     except (TypeError, ValueError, OSError, MemoryError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2

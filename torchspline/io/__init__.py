@@ -1,4 +1,4 @@
-"""Reading and writing recordings: `read_poses`, `read_imu`, `write_poses`, `write_imu`.
+"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`.
 
 To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
 """
@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from torchspline.io import euroc, kitti, tum
+from torchspline.io.bvh import Skeleton, read_bvh
 from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
@@ -18,6 +19,8 @@ __all__ = [
     "ImuParameters",
     "ImuRecord",
     "PoseRecord",
+    "Skeleton",
+    "read_bvh",
     "read_imu",
     "read_imu_parameters",
     "read_poses",
