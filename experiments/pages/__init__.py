@@ -57,8 +57,8 @@ def run_page(page: Path) -> Iterator[tuple[Block, str, dict]]:
         yield block, printed.getvalue(), names
 
 
-def same_output(printed: str, shown: str, relative: float = 0.02) -> bool:
-    """Whether two outputs have the same words, and numbers that agree to a part in fifty or to one of the last digit
+def same_output(printed: str, shown: str, relative: float = 0.05) -> bool:
+    """Whether two outputs have the same words, and numbers that agree to a part in twenty or to one of the last digit
     shown; those below 1e-9 in size, which are rounding errors, need only both be so."""
 
     def words(text: str) -> list[str]:
