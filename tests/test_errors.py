@@ -13,6 +13,7 @@ import error_imu_noise
 import error_imu_strapdown
 import error_online
 import error_robot
+import error_splines
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
@@ -33,6 +34,7 @@ FILES = (
     error_imu_allan,
     error_imu,
     error_robot,
+    error_splines,
 )
 CASES = [case for file in FILES for case in file.CASES]
 
@@ -106,6 +108,7 @@ RESULTS = {
     "Readings",
     "AmbientReadings",
     *error_robot.RESULTS,
+    *error_splines.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
