@@ -1,5 +1,7 @@
 """The documentation: its code runs and prints what the pages say, its pictures exist, and no public name is missing."""
 
+import doctest
+import importlib
 import re
 import sys
 from pathlib import Path
@@ -99,3 +101,26 @@ def test_the_reference_names_what_exists():
 def test_conversions_have_docstrings():
     for name in convert.__all__ if hasattr(convert, "__all__") else ():
         assert getattr(convert, name).__doc__, name
+
+
+# ---------------------------------------------------------------------- examples in docstrings
+
+PACKAGE = Path(torchspline.__file__).parent
+WITH_EXAMPLES = [
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
+
+
+def test_the_most_used_functions_have_examples():
+    assert {"torchspline.splines.bspline", "torchspline.groups.group", "torchspline.fit.problem"} <= set(
+        WITH_EXAMPLES
+    )
+
+
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
+def test_examples_in_docstrings(module):
+    found = doctest.testmod(importlib.import_module(module), optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert found.attempted > 0
+    assert found.failed == 0
