@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `torchspline imu`, `torchspline body`, `torchspline kernels show`."""
+"""The command line: `torchspline demo`, `imu`, `body`, `generate`, `kernels show`."""
 
 import json
 import math
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchspline.cli_body import body
 from torchspline.fit import PoseFit, fit_poses
+from torchspline.generate.command import generate
 from torchspline.groups import SO3, Group
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses, write_imu, write_poses
@@ -341,9 +342,12 @@ def main() -> None:
     """Entry point of the `torchspline` command."""
     from jsonargparse import CLI
 
+    commands = {"demo": demo, "imu": imu, "body": body, "generate": generate, "kernels": {"show": show}}
+    # A truth value takes a word of its own, but nobody types one after --json.
+    arguments = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:
-        status = CLI({"demo": demo, "imu": imu, "body": body, "kernels": {"show": show}}, prog="torchspline")
-    except (TypeError, ValueError, OSError, MemoryError) as error:
+        status = CLI(commands, args=arguments, prog="torchspline")
+    except (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2
     sys.exit(status)
