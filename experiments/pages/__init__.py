@@ -45,16 +45,22 @@ def images(page: Path) -> list[Path]:
 def run_page(page: Path) -> Iterator[tuple[Block, str, dict]]:
     """Runs a page block by block; each with what it printed and the namespace so far.
 
-    Figures go to `figures/` in the current folder. Tracebacks name the page and the line in it.
+    Figures go to `figures/` in the current folder. Tracebacks name the page and the line in it. One thread: the tensors
+    are small, and threads of several processes would wait for each other.
     """
     torch.manual_seed(0)
     names: dict = {"__name__": "page"}
-    for block in blocks(page):
-        printed = io.StringIO()
-        code = compile("\n" * (block.line - 1) + block.code, str(page), "exec")
-        with contextlib.redirect_stdout(printed):
-            exec(code, names)
-        yield block, printed.getvalue(), names
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for block in blocks(page):
+            printed = io.StringIO()
+            code = compile("\n" * (block.line - 1) + block.code, str(page), "exec")
+            with contextlib.redirect_stdout(printed):
+                exec(code, names)
+            yield block, printed.getvalue(), names
+    finally:
+        torch.set_num_threads(threads)
 
 
 def same_output(printed: str, shown: str, relative: float = 0.05) -> bool:
