@@ -231,9 +231,9 @@ def recorded(folder: Path) -> dict[Promise, set[str]]:
 
 _HEAD = """# The gradient contract
 
-Derivatives are part of the interface. For each function and each differentiable argument, the tables say what holds
-where, and which tests keep it. `python tests/contract.py` writes this page from a run of the tests; the suite fails when
-a promise has no test.
+Derivatives are part of the interface. For each function and each differentiable argument, the tables say what
+holds where, and which tests keep it. `python tests/contract.py` writes this page from a run of the tests; the suite
+fails when a promise has no test.
 
 """
 _TAIL = """## What is not promised

@@ -1,4 +1,4 @@
-"""The pictures of the conventions: frames and velocities, sides of a perturbation, the domain, control points and curves."""
+"""The pictures of the documentation: frames and velocities, sides of a perturbation, the domain of a spline, curves."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -54,8 +54,8 @@ def frames() -> Figure:
     )  # fmt: skip
     spline = ts.BSpline(ts.phantom_points(keys, ts.SE3), group=ts.SE3, dt=1.0)
     figure = Figure(figsize=(9.6, 4.6))
-    axes = _space(figure, 111, ((-0.9, 4.1), (-1.2, 1.4), (-0.9, 1.1)), (24, -72), 1.3)
-    axes.set_position((-0.35, -0.16, 1.7, 1.4))
+    axes = _space(figure, 111, ((-0.9, 4.1), (-1.2, 1.4), (-0.9, 1.1)), (24, -72), 1.1)
+    axes.set_position((-0.3, -0.55, 1.6, 2.2))
     origin = torch.tensor([-0.6, -0.6, -0.7], dtype=F64)
     with torch.no_grad():
         poses = spline(torch.linspace(*spline.domain, 200, dtype=F64))
@@ -76,10 +76,12 @@ def frames() -> Figure:
         (pose[:3], 0.9 * motion.velocity, "tab:purple", "velocity, acceleration: world frame"),
         (pose[:3], 0.9 * ts.SO3.act(pose[3:], motion.angular_velocity), "tab:orange",
          "angular velocity, acceleration: body frame"),
-        (torch.tensor([-0.6, 1.3, 0.9], dtype=F64), torch.tensor([0, 0, -0.7], dtype=F64), "k", "gravity: world frame"),
+        (torch.tensor([3.6, 0.6, 0.75], dtype=F64), torch.tensor([0, 0, -0.6], dtype=F64), "k", "gravity: world frame"),
     )  # fmt: skip
     for start, step, color, name in arrows:
-        axes.quiver(*start.tolist(), *step.tolist(), color=color, linewidth=1.8, arrow_length_ratio=0.08, label=name)
+        axes.quiver(
+            *start.tolist(), *step.tolist(), color=color, linewidth=1.8, arrow_length_ratio=0.08, label=name
+        )
     figure.legend(loc="lower center", ncols=3, frameon=False, fontsize=9, bbox_to_anchor=(0.5, 0.0))
     return figure
 
@@ -129,9 +131,7 @@ def domain() -> Figure:
 
 def curves() -> Figure:
     """One set of points in the plane under five schemes: which meet their points, which go round corners."""
-    keys = torch.tensor(
-        [[0.0, 0.0], [1.0, 0.2], [1.4, 1.3], [2.6, 1.4], [3.0, 0.0], [4.2, 0.1]], dtype=F64
-    )
+    keys = torch.tensor([[0.0, 0.0], [1.0, 0.2], [1.4, 1.3], [2.6, 1.4], [3.0, 0.0], [4.2, 0.1]], dtype=F64)
     times = torch.arange(len(keys), dtype=F64)
     t = torch.linspace(0, len(keys) - 1, 400, dtype=F64)
     plane = ts.Rn(2)
