@@ -79,13 +79,22 @@ SPLINES: dict[str, tuple[str, ...]] = {
         "control_points", "t", "gravity", "gyroscope_bias", "accelerometer_bias", "T_body_imu",
     ),
 }  # fmt: skip
+INERTIAL: dict[str, tuple[str, ...]] = {
+    "imu.Imu": (
+        "control_points", "gyroscope_bias", "accelerometer_bias", "gyroscope_scale", "accelerometer_scale",
+        "T_body_imu", "gravity",
+    ),
+    "imu.increments": ("control_points", "t"),
+    "imu.integrate_gyroscope": ("gyroscope", "t", "start"),
+    "imu.strapdown": ("angle", "velocity", "t"),
+}  # fmt: skip
 SOLVERS = {"Problem.solve (differentiable)": ("measurements", "times", "sigma", "covariance", "arguments")}
-FUNCTIONS = {**GROUP_OPERATIONS, **SPLINES, "conversions": ("input",), **SOLVERS}
+FUNCTIONS = {**GROUP_OPERATIONS, **SPLINES, **INERTIAL, "conversions": ("input",), **SOLVERS}
 #: Why a promise is not made, where one might expect it.
 EXCEPTIONS: dict[tuple[str, str, str], str] = {
     **{
         (name, "single", "near pi"): "on which side of pi they are, numbers in single precision cannot tell"
-        for name in SPLINES
+        for name in (*SPLINES, *INERTIAL)
     },
     ("interpolate (squad)", "compile", "general"): "it does, but compiling its many operations takes minutes",
 }
@@ -94,6 +103,11 @@ SECTIONS = {
     "Splines, trajectories, readings": (
         SPLINES,
         "Value and two derivatives, on SE3 and order 4; B-splines also on every group, in orders 2 to 7 and with jerk.",
+    ),
+    "Inertial data": (
+        INERTIAL,
+        "On SE3 and order 4, or for samples that turn as far from one to the next; without noise. Filters, clocks and "
+        "random processes are tested with the sensor model.",
     ),
     "Conversions": ({"conversions": ("input",)}, "Each function of `torchspline.convert`."),
     "Solutions of fits": (SOLVERS, "The control points that `Problem.solve(differentiable=True)` returns."),
@@ -124,12 +138,14 @@ def promises() -> list[Promise]:
 def _properties(function: str) -> tuple[str, ...]:
     if function == "conversions":
         return ("first", "second", "vmap", "compile")
+    if function in INERTIAL:
+        return tuple(name for name in PROPERTIES if name != "compile")
     return ("first",) if function in SOLVERS else tuple(PROPERTIES)
 
 
 def _regimes(function: str, name: str) -> tuple[str, ...]:
     """Compiling does not look at values, except for group operations, which are small enough to try all."""
-    if function in GROUP_OPERATIONS or (function in SPLINES and name != "compile"):
+    if function in GROUP_OPERATIONS or ((function in SPLINES or function in INERTIAL) and name != "compile"):
         return tuple(REGIMES)
     return ("general",)
 

@@ -51,6 +51,7 @@ class Function(NamedTuple):
 
 
 T = number([0.23, 0.9])
+T_SAMPLES = number([0.1, 0.35, 0.6])
 KNOTS = number([-0.6, -0.2, -0.1, 0.0, 0.5, 1.2, 1.3, 1.5, 2.0])
 TIMES = number([0.0, 0.5, 1.3])
 KEYS = number([0.0, 0.4, 1.3, 1.6])
@@ -101,6 +102,34 @@ def _measure(X: Tensor, t: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
     return tuple(ts.imu.measure(_spline(X), t, *others))
 
 
+def _imu(
+    X: Tensor, bg: Tensor, ba: Tensor, sg: Tensor, sa: Tensor, T: Tensor, g: Tensor
+) -> tuple[Tensor, ...]:
+    sensor = ts.imu.Imu(
+        gyroscope_bias=bg, accelerometer_bias=ba, gyroscope_scale=sg, accelerometer_scale=sa, T_body_imu=T, gravity=g
+    )  # fmt: skip
+    return tuple(sensor(_spline(X), T_SAMPLES)[:2])
+
+
+def _increments(X: Tensor, t: Tensor) -> tuple[Tensor, ...]:
+    return tuple(ts.imu.increments(_spline(X), t))
+
+
+def _integrated(gyroscope: Tensor, t: Tensor, start: Tensor) -> tuple[Tensor, ...]:
+    return (ts.imu.integrate_gyroscope(gyroscope, t, start),)
+
+
+def _strapdown(angle: Tensor, velocity: Tensor, t: Tensor) -> tuple[Tensor, ...]:
+    start = ts.imu.Navigation(POSE[3:].to(angle.dtype), POSE[:3].to(angle.dtype), POSE[:3].to(angle.dtype))
+    return tuple(ts.imu.strapdown(ts.imu.Increments(angle, velocity), t, start))
+
+
+def _turns(count: int, seed: int) -> Tensor:
+    """Turns `(rows, count, 3)` by each of the gaps."""
+    size = torch.tensor(ROWS, dtype=F64)[:, None, None]
+    return torch.nn.functional.normalize(normal(len(ROWS), count, 3, seed=seed), dim=-1) * size
+
+
 def _steps() -> list[Tensor]:
     size = torch.tensor(ROWS, dtype=F64)[:, None, None]
     return [
@@ -130,9 +159,22 @@ FUNCTIONS = {
         lambda: [points(5), T, number([0.1, 0.2, -9.8]), number([0.1, 0, 0.2]), number([0, 0.1, 0.3]), POSE],
         1,
     ),
-}
+    "imu.Imu": Function(
+        _imu,
+        lambda: [
+            points(5), number([0.1, 0, 0.2]), number([0, 0.1, 0.3]), number([1.1, 1, 0.9]), number([0.9, 1, 1.2]),
+            POSE, number([0.1, 0.2, -9.8]),
+        ],
+        1,
+    ),
+    "imu.increments": Function(_increments, lambda: [points(5), T_SAMPLES], 1),
+    "imu.integrate_gyroscope": Function(_integrated, lambda: [_turns(4, 5) / 0.3, KEYS, POSE[3:]], 1),
+    "imu.strapdown": Function(
+        _strapdown, lambda: [_turns(3, 5), normal(len(ROWS), 3, 3, seed=6), KEYS], 2
+    ),
+}  # fmt: skip
 #: Hermite splines in logarithms are compiled in test_hermite.py, on a smaller group.
-QUICK_TO_COMPILE = [n for n in FUNCTIONS if n not in ("interpolate (squad)", "hermite (logarithm)")]
+QUICK_TO_COMPILE = [n for n in contract.SPLINES if n not in ("interpolate (squad)", "hermite (logarithm)")]
 each_function = pytest.mark.parametrize("function", FUNCTIONS)
 
 
