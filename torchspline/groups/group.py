@@ -17,7 +17,7 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Group:
-    """A Lie group by name: "SO3", "SE3", "DualQuaternion", "SO2", "SE2", "R<n>", or a direct product such as "R3xSO3".
+    """A Lie group by name: "SO3", "SE3", "DualQuaternion", "SO2", "SE2", `"R<n>"`, or a product such as "R3xSO3".
 
     Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`, [v, omega] in m and rad; leading dimensions
     broadcast. Every method is differentiable in its tensors to any order, forwards and backwards; `log`,
