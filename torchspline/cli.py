@@ -1,4 +1,4 @@
-"""The command line: `torchspline demo`, `imu`, `body`, `generate`, `kernels show`."""
+"""The command line: `torchspline demo`, `imu`, `body`, `generate`, `calibrate camera-imu`, `kernels show`."""
 
 import json
 import math
@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from torchspline.calibrate.command import COMMAND, camera_imu, run
 from torchspline.cli_body import body
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.generate.command import generate
@@ -342,11 +343,19 @@ def main() -> None:
     """Entry point of the `torchspline` command."""
     from jsonargparse import CLI
 
-    commands = {"demo": demo, "imu": imu, "body": body, "generate": generate, "kernels": {"show": show}}
+    commands = {
+        "demo": demo,
+        "imu": imu,
+        "body": body,
+        "generate": generate,
+        "calibrate": {"camera-imu": camera_imu},
+        "kernels": {"show": show},
+    }
     # A truth value takes a word of its own, but nobody types one after --json.
     arguments = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:
-        status = CLI(commands, args=arguments, prog="torchspline")
+        own = tuple(arguments[:2]) == COMMAND
+        status = run(arguments[2:]) if own else CLI(commands, args=arguments, prog="torchspline")
     except (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
         print(f"torchspline: {error}", file=sys.stderr)
         status = 2

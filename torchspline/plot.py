@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -15,13 +15,14 @@ _AXES = ("x", "y", "z")
 
 
 def imu_comparison(
-    path: str | Path,
+    path: str | Path | BinaryIO,
     lines: tuple[Tensor, ImuReading],
     dots: tuple[Tensor, ImuReading] | None = None,
     title: str = "",
     labels: Sequence[str] = ("synthesised", "recorded"),
 ) -> None:
-    """Recorded inertial readings as dots under synthesised lines, as in [S20] Figure 1; written to `path`.
+    """Recorded inertial readings as dots under synthesised lines, as in [S20] Figure 1; written to `path`,
+    which may be an open file: as PNG then.
 
     Args:
         lines, dots: times (N,) in s and readings (N, 3) in rad/s and m/s^2.

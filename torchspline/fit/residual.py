@@ -131,6 +131,8 @@ class Residual(ABC):
     slots: ClassVar[Mapping[str, Slot]] = {}
     #: Whether its loops are compiled; with very many operations tensors are quicker than waiting for that.
     compiled: ClassVar[bool] = True
+    #: The `Term` that binds it to a problem, where that is not the common one.
+    term: ClassVar[Any] = None
 
     def __init__(
         self,

@@ -1,4 +1,5 @@
-"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`.
+"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`; and what
+calibration finds: `read_imu_parameters`, `read_camchain` and their writers.
 
 To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
 """
@@ -10,20 +11,26 @@ import torch
 
 from torchspline.io import euroc, kitti, tum
 from torchspline.io.bvh import Skeleton, read_bvh
+from torchspline.io.camchain import CamChain, read_camchain, write_camchain
+from torchspline.io.camera import Camera
 from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
 from torchspline.io.text import Table, read_table
 
 __all__ = [
+    "CamChain",
+    "Camera",
     "ImuParameters",
     "ImuRecord",
     "PoseRecord",
     "Skeleton",
     "read_bvh",
+    "read_camchain",
     "read_imu",
     "read_imu_parameters",
     "read_poses",
+    "write_camchain",
     "write_imu",
     "write_imu_parameters",
     "write_poses",
