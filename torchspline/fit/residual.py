@@ -65,8 +65,9 @@ class Clock:
         offset, skew: unknowns of one number each, s and s/s.
         mid: time of the trajectory at which the skew turns, in the unit of its times; by default the middle of its
             domain.
-        delay: an unknown of one number, s: the line delay of a rolling shutter. late: by how many delays each
-            measurement is later, (N,), such as the line it was seen on.
+        delay: an unknown of one number, s, such as the line delay of a rolling shutter. late: by how many delays the
+            stamp of each measurement comes late, (N,): minus the line it was seen on, if images bear the stamp of their
+            first line, since later lines are exposed after it.
     Raises:
         TypeError, ValueError: a wrong type or shape, or one of `delay` and `late` without the other.
     """
