@@ -96,6 +96,11 @@ EXCEPTIONS: dict[tuple[str, str, str], str] = {
         (name, "single", "near pi"): "on which side of pi they are, numbers in single precision cannot tell"
         for name in (*SPLINES, *INERTIAL)
     },
+    (
+        "interpolate (cumulative_bspline)",
+        "compile",
+        "general",
+    ): "it is compiled as `nonuniform_bspline`, which it is",
     ("interpolate (squad)", "compile", "general"): "it does, but compiling its many operations takes minutes",
 }
 SECTIONS = {
