@@ -68,10 +68,22 @@ class Sampling(nn.Module):
             if checks.seen_true(largest < 1.0) is False:
                 raise ValueError(f"{name}: expected numbers below 1, got {largest.item():g}")
 
-    def forward(self, trajectory: Trajectory, t: Tensor, generator: Generators = None) -> Instants:
+    @property
+    def random(self) -> bool:
+        """Whether it draws random numbers."""
+        return self.jitter is not None or self.drop_probability is not None
+
+    def forward(
+        self,
+        trajectory: Trajectory,
+        t: Tensor,
+        generator: Generators = None,
+        batch: Sequence[int] = (),
+    ) -> Instants:
         """Instants of the samples with stamps `t` (N,) or (*batch, N), seconds or int64 nanoseconds.
 
-        Jitter does not reach beyond a domain whose trajectory refuses times outside.
+        Jitter does not reach beyond a domain whose trajectory refuses times outside. Each sensor of the `batch` has
+        jitter and losses of its own.
         """
         own = {n: x.shape for n, x in (*self._parameters.items(), *self._buffers.items()) if x is not None}
         checks.broadcast(t=t.shape[:-1], **own)
@@ -90,13 +102,10 @@ class Sampling(nn.Module):
         elif self.time_offset is not None:
             late = _column(self.time_offset)
         at = t if late is None else shifted(t, -late)
-        batch = at.shape[:-1]
-        for x in (self.jitter, self.drop_probability):
-            if x is not None:
-                batch = torch.broadcast_shapes(batch, x.shape)
         valid = torch.ones((), dtype=torch.bool, device=t.device).expand(at.shape)
-        if self.jitter is None and self.drop_probability is None:
+        if not self.random:
             return Instants(at, valid)
+        batch = checks.broadcast(batch=batch, t=at.shape[:-1], **own)
         if isinstance(generator, Sequence) and not batch:
             batch = torch.Size([len(generator)])
         # Two columns whatever is used, so that one effect does not change the random numbers of another.

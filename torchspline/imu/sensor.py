@@ -26,10 +26,11 @@ from torchspline.imu.parameters import ImuNoise
 from torchspline.imu.parts import (
     above_zero,
     along_time,
+    batch_of,
     bias_of,
     drawing_device,
     keep,
-    mean_rate,
+    sample_rate,
     tensor_of,
     times_of,
 )
@@ -237,7 +238,10 @@ class Imu(nn.Module):
                 f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
             )
         at = t.reshape(1) if t.ndim == 0 else t
-        instants, valid = self.sampling(trajectory, at, generator)
+        own = self._batches()
+        if self.sampling.random:
+            own["trajectory"] = batch_of(trajectory, at)
+        instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
         signal = self._filtered(self._exposure(trajectory, at, instants), instants)
         checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
         if self.dtype is not None:
@@ -343,11 +347,13 @@ class Imu(nn.Module):
         if not self.averaging:
             return exposure(trajectory, instants, scene)
         nodes, weights = np.polynomial.legendre.leggauss(self.averaging)
-        interval = 1.0 / self._rate(at)
+        interval = 1.0 / sample_rate(at, self.rate)
+        interval = interval if interval.ndim == 0 else interval.unsqueeze(-1)
         total: Tensor | None = None
         for node, weight in zip(nodes, weights, strict=True):
-            back = torch.tensor(0.5 * (node - 1.0) * interval, dtype=torch.float64, device=instants.device)
-            part = exposure(trajectory, excursion(trajectory, instants, back), scene)
+            part = exposure(
+                trajectory, excursion(trajectory, instants, 0.5 * (node - 1.0) * interval), scene
+            )
             total = part * (0.5 * weight) if total is None else torch.add(total, part, alpha=0.5 * weight)
         assert total is not None
         return total
@@ -431,7 +437,9 @@ class Imu(nn.Module):
         own = densities["noise_density"]
         if own is None:
             return bias, None
-        white = white_noise(shape, own, self._rate(at), generator, signal.dtype)
+        rate = sample_rate(t, self.rate)
+        rate = rate if rate.ndim == 0 else rate[..., None, None]
+        white = white_noise(shape, own, rate, generator, signal.dtype)
         return bias, white.to(signal.device)
 
     def _converted(self, signal: Tensor) -> Tensor:
@@ -451,9 +459,6 @@ class Imu(nn.Module):
         if all(x is None for x in both):
             return None
         return _joined(*(like.new_full((3,), missing) if x is None else along_time(x, like) for x in both))
-
-    def _rate(self, at: Tensor) -> float:
-        return mean_rate(at) if self.rate is None else self.rate
 
 
 def _check_readings(readings: Any) -> None:
