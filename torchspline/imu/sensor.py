@@ -284,6 +284,10 @@ class Imu(nn.Module):
             TypeError, ValueError: a wrong type, shape or dtype; a bias that is a trajectory and is not given here.
         """
         _check_readings(readings)
+        if isinstance(readings, Readings) and readings.t.ndim == 0:  # as those of a single stamp
+            biases = (x if x is None else x.unsqueeze(-2) for x in (gyroscope_bias, accelerometer_bias))
+            row = (readings.gyroscope.unsqueeze(-2), readings.accelerometer.unsqueeze(-2))
+            return ImuReading(*(x.squeeze(-2) for x in self.correct(ImuReading(*row), *biases)))
         parts = []
         for name, x, given in (
             ("gyroscope_bias", readings.gyroscope, gyroscope_bias),
@@ -321,10 +325,16 @@ class Imu(nn.Module):
             Increments: (*batch, N, 3).
         Differentiable in readings and t.
         Raises:
-            TypeError, ValueError: a wrong type, shape or value.
+            TypeError, ValueError: a wrong type, shape or value, or samples that were lost.
         """
         _check_readings(readings)
         w, f = readings.gyroscope, readings.accelerometer
+        valid = getattr(readings, "valid", None)
+        if valid is not None and checks.values_visible(valid) and checks.seen_true(valid.all()) is False:
+            raise ValueError(
+                f"readings: expected samples that all arrived, got {int((~valid).sum())} lost ones, which read zero; "
+                "fill them in, or leave them out with their stamps"
+            )
         if not self.averaging:
             return sampled_increments(ImuReading(w, f), t)
         h = stamps.intervals(t, w.shape[:-1], w.dtype, device=w.device).unsqueeze(-1)
@@ -450,7 +460,8 @@ class Imu(nn.Module):
         if step is not None:
             fine = step == 0.0  # one sensor has a resolution, the other has none
             rounded = quantise(signal, torch.where(fine, 1.0, step))
-            signal = torch.where(fine, signal, rounded) if fine.any() else rounded
+            whole = self.gyroscope_resolution is not None and self.accelerometer_resolution is not None
+            signal = rounded if whole else torch.where(fine, signal, rounded)
         return signal
 
     def _pair(self, name: str, like: Tensor, missing: float) -> Tensor | None:
