@@ -68,7 +68,7 @@ def test_sensors_on_one_trajectory_have_jitter_of_their_own():
 def test_generators_of_a_wrong_number_are_named_whatever_draws():
     t = torch.linspace(0.1, 1.0, 5, dtype=F64)
     for sensor in (imu.Imu(jitter=1e-4), imu.Imu(drop_probability=0.1), imu.Imu(noise=imu.ImuNoise(0.1))):
-        with pytest.raises(ValueError, match="generator: expected one, or one for each row.*got 2"):
+        with pytest.raises(ValueError, match=r"generator: expected one, or one for each row.*got 2"):
             sensor(spline(3), t, generators(2))
 
 
@@ -145,7 +145,10 @@ def test_vectors_of_the_world_are_not_taken_for_samples(name):
     together = imu.strapdown(increments, t, start, **{name: g[:, None]})
     for i in range(3):
         one = imu.strapdown(
-            imu.Increments(*(x[i] for x in increments)), t, imu.Navigation(*(x[i] for x in start)), **{name: g[i]}
+            imu.Increments(*(x[i] for x in increments)),
+            t,
+            imu.Navigation(*(x[i] for x in start)),
+            **{name: g[i]},
         )
         assert torch.allclose(together.position[i], one.position, atol=1e-12)
 

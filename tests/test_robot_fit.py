@@ -197,6 +197,21 @@ def test_delays_of_velocities_are_found(nanoseconds):
     assert without.velocity_residual.square().mean().sqrt() > 2e-3
 
 
+def test_joints_at_rest_have_no_delay_of_velocities():
+    """Neither an exact log of them nor one with noise, beside a joint that tells its own."""
+    t = torch.arange(200, dtype=F64) * 0.01
+    moving = torch.stack([torch.sin(6 * t), 6 * torch.cos(6 * (t - 0.004))])
+    for scale in (0.0, 1.0):
+        q = torch.stack([moving[0], torch.ones_like(t)], -1) + scale * 1e-6 * noise(200, 2)
+        rate = torch.stack([moving[1], torch.zeros_like(t)], -1) + scale * 1e-4 * noise(200, 2, seed=1)
+        delay = fit_joints(t, q, rate, dt=0.05, estimate_delay=True).velocity_delay
+        assert abs(delay[0] - 0.004) < 1e-4
+        assert abs(delay[1]) <= scale * 1e-3
+    at_rest = fit_joints(t, q[:, 1:].round(), 0 * t[:, None], dt="auto", estimate_delay=True)
+    assert at_rest.velocity_delay == 0.0
+    assert (at_rest.trajectory(t) - 1.0).abs().max() < 1e-9
+
+
 @pytest.mark.realdata
 def test_ur10e_log(shared_data):
     """The spline's velocity is within the noise of the recorded one, seen from a fit of that alone [SciPy], once it is

@@ -108,12 +108,6 @@ def allan_deviation(x: Tensor, t: Tensor, clusters: Sequence[int] | None = None)
     steps = stamps.intervals(t, (x.shape[-2],), torch.float64, device=x.device).cpu()
     interval, index = _grid(steps)
     count = int(index[-1]) + 1
-    if count > _SPARSEST * len(index):
-        longest = int(steps.argmax())
-        raise ValueError(
-            f"t: expected a record of which more than one sample in {_SPARSEST} is there, got a gap of "
-            f"{steps[longest].item():g} s between samples {longest} and {longest + 1}; cut it there"
-        )
     sizes = _cluster_sizes(clusters, count)
 
     values = x.detach().to("cpu", torch.float64)
@@ -294,6 +288,12 @@ def _grid(steps: Tensor) -> tuple[float, Tensor]:
     # The mean of single steps: jitter of single stamps, which a median keeps, cancels in it.
     single = steps[steps < 1.5 * steps.median()].mean()
     multiples = (steps / single).round()
+    if multiples.sum() > _SPARSEST * len(steps):
+        at = int(steps.argmax())
+        raise ValueError(
+            f"t: expected a record of which more than one sample in {_SPARSEST} is there, got a gap of "
+            f"{steps[at].item():g} s between samples {at} and {at + 1}; cut it there"
+        )
     off = (steps / single - multiples).abs()
     if bool((off > _JITTER).any()) or bool((multiples < 1).any()):
         at = int(torch.nonzero((off > _JITTER) | (multiples < 1))[0])

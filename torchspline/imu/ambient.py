@@ -11,7 +11,16 @@ from torchspline.groups.group import SO3
 from torchspline.imu.earth import standard_pressure
 from torchspline.imu.filters import LowPass
 from torchspline.imu.noise import Generators, random_walk, white_noise
-from torchspline.imu.parts import above_zero, along_time, batch_of, drawing_device, keep, sample_rate, tensor_of, times_of
+from torchspline.imu.parts import (
+    above_zero,
+    along_time,
+    batch_of,
+    drawing_device,
+    keep,
+    sample_rate,
+    tensor_of,
+    times_of,
+)
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling
 from torchspline.splines.trajectory import Kinematics, Trajectory

@@ -361,9 +361,7 @@ class Imu(nn.Module):
         interval = interval if interval.ndim == 0 else interval.unsqueeze(-1)
         total: Tensor | None = None
         for node, weight in zip(nodes, weights, strict=True):
-            part = exposure(
-                trajectory, excursion(trajectory, instants, 0.5 * (node - 1.0) * interval), scene
-            )
+            part = exposure(trajectory, excursion(trajectory, instants, 0.5 * (node - 1.0) * interval), scene)
             total = part * (0.5 * weight) if total is None else torch.add(total, part, alpha=0.5 * weight)
         assert total is not None
         return total

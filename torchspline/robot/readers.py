@@ -85,7 +85,9 @@ def content(source: str | PathLike[str]) -> tuple[str, bytes]:
     path = Path(source)
     if not str(source) or not path.is_file():
         came = str(source) if len(str(source)) <= 200 else str(source)[:197] + "..."
-        raise FileNotFoundError(f"source: expected XML text or the path of a file, got {came!r}: no such file")
+        raise FileNotFoundError(
+            f"source: expected XML text or the path of a file, got {came!r}: no such file"
+        )
     return str(path), path.read_bytes()
 
 
@@ -139,7 +141,9 @@ def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
             move = (Move(driver, _urdf_screw(joint), factor, offset),)
         pose = _origin(joint.origin)
         if not np.isfinite(pose).all():
-            raise ValueError(f"source: joint {joint.name!r} has an origin that is not finite; expected numbers")
+            raise ValueError(
+                f"source: joint {joint.name!r} has an origin that is not finite; expected numbers"
+            )
         frames.append(Frame(joint.child, joint.parent, pose, move))
         stack += reversed(children.get(joint.child, []))
     if len(frames) != len(links):
