@@ -167,3 +167,32 @@ def test_sensors_with_range_resolution_and_averaging_under_vmap():
 def test_a_ratio_of_correlation_times_beyond_numbers():
     with pytest.raises(ValueError, match="correlation_times: expected a ratio"):
         imu.flicker_noise((5, 1), 1.0, torch.arange(5.0), correlation_times=(1e-300, 1e300))
+
+
+@pytest.mark.parametrize("name", ["imu", "magnetometer"])
+def test_filters_need_jitter_that_keeps_the_order(name):
+    filtered = {"imu": "gyroscope_filter", "magnetometer": "low_pass"}[name]
+    t = torch.linspace(0.1, 1.0, 40, dtype=F64)
+    sensor = sensors(jitter=0.05)[name]
+    assert sensor(spline(), t, imu.item_generator(0, 0)).instants.diff().min() < 0
+    setattr(sensor, filtered, imu.LowPass(20.0))
+    with pytest.raises(ValueError, match="jitter: expected instants that increase"):
+        sensor(spline(), t, imu.item_generator(0, 0))
+
+
+def test_single_precision_that_leaves_nothing_of_intervals_is_refused():
+    """An eighth of a revolution a second: 1 % of an interval is lost after 1000 s, a fifth after 10,000 s."""
+    t, w = torch.arange(400, dtype=F64) * 0.005, torch.full((400, 3), 0.45, dtype=F64)
+    exact = imu.integrate_gyroscope(w, t)
+    late = imu.integrate_gyroscope(w, (1000.0 + t).float())
+    assert (late - exact).abs().max() < 1e-4
+    for use in (
+        lambda t: imu.integrate_gyroscope(w, t),
+        lambda t: imu.random_walk((400, 1), 1.0, t),
+        lambda t: imu.LowPass(10.0)(w, t),
+    ):
+        use(10000.0 + t)
+        with pytest.raises(
+            ValueError, match=r"t: float32 rounds times near 1e.04 s .* of the interval of 0.005 s"
+        ):
+            use((10000.0 + t).float())

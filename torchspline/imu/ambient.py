@@ -22,7 +22,7 @@ from torchspline.imu.parts import (
     times_of,
 )
 from torchspline.imu.quantise import quantise, saturate
-from torchspline.imu.sampling import Sampling
+from torchspline.imu.sampling import Sampling, in_order
 from torchspline.splines.trajectory import Kinematics, Trajectory
 
 Given = Tensor | Sequence[float] | float | None
@@ -112,6 +112,8 @@ class _Ambient(nn.Module):
         checks.broadcast(trajectory=moving.shape[:-2], **self._batches())
         signal = self._signal(motion)
         if self.low_pass is not None:
+            if self.sampling.jitter is not None:
+                in_order(instants)
             signal = self.low_pass(signal, instants)
         if self.dtype is not None:
             signal = signal.to(self.dtype)

@@ -137,6 +137,18 @@ def shifted(t: Tensor, by: Tensor) -> Tensor:
     return t + (by / _NANOSECOND).round().to(torch.int64)
 
 
+def in_order(instants: Tensor) -> Tensor:
+    """The instants themselves, which a filter needs to increase, as jitter may not let them."""
+    steps = instants.detach().diff(dim=-1)
+    if checks.values_visible(steps) and steps.numel() and checks.seen_true((steps > 0).all()) is False:
+        unit = _NANOSECOND if instants.dtype == torch.int64 else 1.0
+        raise ValueError(
+            "jitter: expected instants that increase, as stamps do, where a filter follows, got two "
+            f"{steps.min().item() * unit:g} s apart; choose one well below the interval of stamps, and these increasing"
+        )
+    return instants
+
+
 def excursion(trajectory: Trajectory, t: Tensor, by: Tensor) -> Tensor:
     """Times `by` seconds later, kept inside the domain where t is and where nothing lies beyond."""
     moved = shifted(t, by)

@@ -35,7 +35,7 @@ from torchspline.imu.parts import (
     times_of,
 )
 from torchspline.imu.quantise import quantise, saturate
-from torchspline.imu.sampling import Sampling, excursion
+from torchspline.imu.sampling import Sampling, excursion, in_order
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
 from torchspline.kernels.mode import plain
 from torchspline.splines.trajectory import MECHANICS, Trajectory
@@ -370,6 +370,8 @@ class Imu(nn.Module):
         first, second = self.gyroscope_filter, self.accelerometer_filter
         if first is None and second is None:
             return signal
+        if self.sampling.jitter is not None:
+            in_order(t)
         if first is second and first is not None:
             return first(signal, t)
         gyroscope, accelerometer = signal[..., :3], signal[..., 3:]
