@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchspline import SE3, BSpline, imu
+from torchspline import R3, SE3, BSpline, imu
 
 F64 = torch.float64
 ONES = (1.0,) * 10
@@ -59,10 +59,12 @@ def test_items_of_a_batch_have_jitter_and_losses_of_their_own(name):
 
 
 def test_sensors_on_one_trajectory_have_jitter_of_their_own():
-    sensor = imu.Imu(gyroscope_bias=torch.zeros(2, 3, dtype=F64), jitter=1e-4)
-    instants = sensor(spline(), torch.linspace(0.1, 1.0, 5, dtype=F64), imu.item_generator(0, 0)).instants
-    assert instants.shape == (2, 5)
-    assert (instants[0] != instants[1]).all()
+    constant = torch.zeros(2, 14, 3, dtype=F64)
+    for bias in (constant[:, 0], BSpline(constant, group=R3, order=4, dt=0.1)):
+        sensor = imu.Imu(gyroscope_bias=bias, jitter=1e-4)
+        instants = sensor(spline(), torch.linspace(0.1, 1.0, 5, dtype=F64), imu.item_generator(0, 0)).instants
+        assert instants.shape == (2, 5)
+        assert (instants[0] != instants[1]).all()
 
 
 def test_generators_of_a_wrong_number_are_named_whatever_draws():

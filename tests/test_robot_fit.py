@@ -1,5 +1,7 @@
 """Splines of joints: from encoder logs, and from sensors on links."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from fit_oracle import check_assembly
 from robot_cases import F64, MOUNT, URDF, joint_spline, ur10e_log
 from scipy.interpolate import make_lsq_spline
 
-from torchspline import SE3, SO3, BSpline, Rn, fit, imu
+from torchspline import SE3, SO3, BSpline, Rn, fit, imu, use_kernels
 from torchspline.robot import Robot, fit_joints
 
 ROBOT = Robot.from_urdf(URDF)
@@ -31,6 +33,21 @@ def stamps(count):
 
 
 # ---------------------------------------------------------------------- sensors on links
+
+
+def test_sensors_on_links_go_through_pickle():
+    """To other processes: their classes are made on the way, and made again there."""
+    t = stamps(5)
+    made = ROBOT.residual("right", fit.Gyroscope, t, noise(5, 3), base=BASE, sigma=0.7)
+    again = pickle.loads(pickle.dumps(made))
+    assert type(again) is type(made)
+    costs = []
+    for residual in (made, again):
+        problem = fit.Problem(start(0.1))
+        problem.add(residual)
+        with use_kernels("reference"):
+            costs.append(problem.solve().cost)
+    assert costs[0] == costs[1]
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ class Sampling(nn.Module):
     Args:
         time_offset: s, by which stamps are late; a number or (*batch,).
         time_skew: s/s; a number or (*batch,).
-        jitter: s, standard deviation, independent from sample to sample.
-        drop_probability: of each sample to be lost, independently; at least 0, below 1.
+        jitter: s, standard deviation, independent from sample to sample and from one of a batch to the next.
+        drop_probability: of each sample to be lost, likewise independently; at least 0, below 1.
     """
 
     time_offset: Tensor | None

@@ -40,6 +40,7 @@ from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
 from torchspline.kernels.mode import plain
 from torchspline.splines.trajectory import MECHANICS, Trajectory
 
+BIASES = ("gyroscope_bias", "accelerometer_bias")
 Given = Tensor | Sequence[float] | float | None
 
 
@@ -79,7 +80,7 @@ class Imu(nn.Module):
 
     Args:
         noise: densities and random biases; None: no noise.
-        rate: Hz, samples per second that the sensor takes; None: from the mean interval of the stamps.
+        rate: Hz, samples per second that the sensor takes; None: from the mean interval of the stamps, of each row.
         gyroscope_bias, accelerometer_bias: (3,) rad/s and m/s^2, or a trajectory in R3, read at the instants.
         gyroscope_scale, accelerometer_scale: (3,) factors, 1 is perfect; above zero.
         gyroscope_misalignment, accelerometer_misalignment: (3,) entries yx, zx, zy of lower triangular matrices.
@@ -240,7 +241,8 @@ class Imu(nn.Module):
         at = t.reshape(1) if t.ndim == 0 else t
         own = self._batches()
         if self.sampling.random:
-            own["trajectory"] = batch_of(trajectory, at)
+            biases = {n: x for n in BIASES if isinstance(x := getattr(self, n), Trajectory)}
+            own |= {name: batch_of(x, at) for name, x in {"trajectory": trajectory, **biases}.items()}
         instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
         signal = self._filtered(self._exposure(trajectory, at, instants), instants)
         checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
@@ -284,10 +286,10 @@ class Imu(nn.Module):
             TypeError, ValueError: a wrong type, shape or dtype; a bias that is a trajectory and is not given here.
         """
         _check_readings(readings)
-        if isinstance(readings, Readings) and readings.t.ndim == 0:  # as those of a single stamp
+        if isinstance(readings, Readings) and readings.t.ndim == 0:  # as a row of one
+            row = ImuReading(readings.gyroscope.unsqueeze(-2), readings.accelerometer.unsqueeze(-2))
             biases = (x if x is None else x.unsqueeze(-2) for x in (gyroscope_bias, accelerometer_bias))
-            row = (readings.gyroscope.unsqueeze(-2), readings.accelerometer.unsqueeze(-2))
-            return ImuReading(*(x.squeeze(-2) for x in self.correct(ImuReading(*row), *biases)))
+            return ImuReading(*(x.squeeze(-2) for x in self.correct(row, *biases)))
         parts = []
         for name, x, given in (
             ("gyroscope_bias", readings.gyroscope, gyroscope_bias),
@@ -401,7 +403,7 @@ class Imu(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         """Bias (..., 1 or N, 6) and white noise (..., N, 6)."""
         parts = []
-        for bias in (self.gyroscope_bias, self.accelerometer_bias):
+        for bias in (getattr(self, name) for name in BIASES):
             if isinstance(bias, Trajectory):
                 parts.append(bias(instants).to(signal))
             elif bias is None:

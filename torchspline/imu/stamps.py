@@ -23,7 +23,8 @@ def intervals(
     """Seconds between neighbouring times, (..., N - 1); differences are taken before any rounding.
 
     Args:
-        t: seconds (float) or nanoseconds (int64), (N,) or what broadcasts to `samples`. samples: (*batch, N).
+        t: seconds (float; in float32 within 2000 s of zero at 200 Hz) or nanoseconds (int64), (N,) or what broadcasts
+            to `samples`. samples: (*batch, N).
         repeated: whether times may be equal. device: where the samples are, if they are somewhere.
     Raises:
         TypeError, ValueError: not times, of a wrong shape, not increasing, or float32 too far from zero.
