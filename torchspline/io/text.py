@@ -1,8 +1,8 @@
 """Tables of numbers in text files: reading with errors that name the line, exact stamps, writing."""
 
 import gzip
+import io
 import re
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchspline.io.archive import read_bytes
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -146,12 +148,13 @@ def read_table(path: Path) -> Table:
         FileNotFoundError: no such file.
         ValueError: damaged gzip, or a file without any row.
     """
-    text = _read_text(path).replace("\r\n", "\n").replace("\r", "\n")
+    # Bytes that are no text become fields that are no numbers, and those are reported with their line.
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
     head: list[str] = []
     lines: list[int] = []
     rows: list[list[str]] = []
     header = commas = False
-    for number, line in enumerate(text.split("\n"), 1):
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):  # a line in memory at a time
         line = line.strip()
         if not line:
             continue
@@ -183,22 +186,6 @@ def write_table(
     rows = (separator.join([t, *map(repr, row)]) for t, row in zip(stamps, values.tolist(), strict=True))
     content = "\n".join([head, *rows, ""]).encode()
     path.write_bytes(gzip.compress(content, compresslevel=6, mtime=0) if path.suffix == ".gz" else content)
-
-
-def _read_text(path: Path) -> str:
-    if path.is_dir():
-        raise ValueError(f"{path}: expected a file, got a folder")
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    if content.startswith(b"\x1f\x8b"):
-        try:
-            content = gzip.decompress(content)
-        except (OSError, EOFError, zlib.error) as reason:
-            raise ValueError(f"{path}: expected gzipped text, got damaged data ({reason})") from None
-    # Bytes that are no text become fields that are no numbers, and those are reported with their line.
-    return content.decode("utf-8-sig", errors="replace")
 
 
 def _is_number(field: str) -> bool:
