@@ -49,7 +49,7 @@ def parse(
         parser.add_argument(
             "--json", action="store_true", default=False, help="print one line of JSON instead of tables"
         )
-    lists = {name: get_args(hint)[0] for name, hint in hints.items() if get_origin(hint) is list}
+    lists = {name: kind for name, hint in hints.items() if (kind := _of_list(hint)) is not None}
     for name, kind in lists.items():
         parser.add_argument(
             f"--{name}", type=kind, nargs="+", required=parameters[name].default is _NONE, metavar="WORD",
@@ -65,6 +65,12 @@ def parse(
     chosen = parser.instantiate_classes(chosen)
     values = {name: getattr(chosen, name) for name in parameters}
     return partial(function, **values), not own_json and chosen.json
+
+
+def _of_list(hint: Any) -> Any:
+    """Of what a `list[...]` or `list[...] | None` is a list; None of anything else."""
+    kinds = [x for x in (hint, *get_args(hint)) if get_origin(x) is list]
+    return get_args(kinds[0])[0] if kinds else None
 
 
 def _spelled_out(words: Sequence[str], switches: set[str], options: set[str]) -> list[str]:

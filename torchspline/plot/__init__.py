@@ -3,7 +3,7 @@
 Every function returns a `matplotlib.figure.Figure`; `figure.savefig(path)` writes it. `allan_panel` draws on axes.
 """
 
-from torchspline.plot.basis import basis
+from torchspline.plot.basis import basis, basis_functions
 from torchspline.plot.inertial import allan, allan_panel, imu_comparison
 from torchspline.plot.motion import covariance_tube, rates, trajectory
 from torchspline.plot.residuals import residuals
@@ -12,6 +12,7 @@ __all__ = [
     "allan",
     "allan_panel",
     "basis",
+    "basis_functions",
     "covariance_tube",
     "imu_comparison",
     "rates",
