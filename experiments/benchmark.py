@@ -52,7 +52,8 @@ def experiment(
     """Times this library against its goals and against others.
 
     Args:
-        sections: which of goals, queries, points, orders, batch, settings, groups, latency, operations, processes.
+        sections: which of goals, queries, points, orders, batch, settings, groups, latency, operations, jacobians,
+            processes.
         goals: parts of the names of the goals to measure; none for all of them.
         operations: group operations of the section of that name, such as "SO3 exp".
         queries, points, orders, batches: sizes of the sweep of that name.
@@ -122,10 +123,12 @@ if __name__ == "__main__":
     run(
         experiment,
         smoke={
-            "sections": ["goals", "queries", "operations"],
+            "sections": ["goals", "queries", "operations", "jacobians"],
             "goals": ["SO(3), 1e5", "module call", "quaternion"],
             "operations": ["SO3 compose"],
             "queries": [10, 1000],
+            "orders": [4],
+            "base": 1000,
             "rounds": 2,
             "patience": 0.1,
             "shrink": 100,

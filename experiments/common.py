@@ -130,7 +130,7 @@ def _plain(value: Any) -> Any:
 def show(out: Path, tables: Sequence[Table]) -> Path:
     """Writes the tables to `table.md` and prints them."""
     path = out / "table.md"
-    path.write_text("\n".join(map(_markdown, tables)), encoding="utf-8")
+    path.write_text("\n".join(map(markdown, tables)), encoding="utf-8")
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     for table in tables:
         printed = RichTable(title=escape(table.title), title_justify="left", box=box.SIMPLE_HEAD)
@@ -142,7 +142,9 @@ def show(out: Path, tables: Sequence[Table]) -> Path:
     return path
 
 
-def _markdown(table: Table) -> str:
+def markdown(table: Table) -> str:
+    """A table as Markdown."""
+
     def line(cells: Sequence[Any]) -> str:
         return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
 

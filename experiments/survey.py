@@ -5,8 +5,10 @@ from typing import Any
 
 import torch
 from common import Table, run, show
+from interpolation.choose import page
 from interpolation.figures import figure_1, figure_2, figure_3, figure_4, figure_5_drawn, figure_6_drawn
 from interpolation.measure import properties, runtime
+from interpolation.orders import FAMILIES, family_order, needs, order
 
 from torchspline.splines.interpolation import SURVEY
 
@@ -30,14 +32,18 @@ def _rows(figures: dict[str, float]) -> list[list[str]]:
     return [[name, f"{x:.3g}"] for name, x in figures.items()]
 
 
-def experiment(out: Path, batch: int, repetitions: int, threads: int, seed: int) -> dict[str, Any]:
-    """Figures 1 to 6 and Table 2 of the survey of interpolation methods, and an overview of what was measured.
+def experiment(
+    out: Path, batch: int, repetitions: int, threads: int, tolerance: float, seed: int
+) -> dict[str, Any]:
+    """Figures 1 to 6 and Table 2 of the survey of interpolation methods, an overview of what was measured, and which
+    spline to use (`which_spline.md`), decided by that.
 
     Args:
         out: folder for the results.
         batch: evaluations at once for the runtimes.
         repetitions: of each timing; the fastest counts.
         threads: of torch while timing.
+        tolerance: m and rad, to which a smooth motion is followed by every family.
         seed: of the keys.
     """
     for draw in (figure_1, figure_2, figure_3):
@@ -49,9 +55,13 @@ def experiment(out: Path, batch: int, repetitions: int, threads: int, seed: int)
     try:
         times = {name: runtime(name, batch, repetitions, 0, seed) for name in SURVEY}
         rates = {name: runtime(name, batch, repetitions, 2, seed) for name in TABLE_2}
+        families = {name: needs(name, tolerance, batch, repetitions, seed) for name in FAMILIES}
     finally:
         torch.set_num_threads(before)
-    measured = {name: properties(name, seed) for name in SURVEY}
+    measured = {name: {**properties(name, seed), "order": order(name, seed)} for name in SURVEY}
+    for name, case in families.items():
+        case["order"] = family_order(name, seed)
+    (out / "which_spline.md").write_text(page(measured, times, families, tolerance), encoding="utf-8")
 
     runtimes = [
         [name, f"{paper}", f"{times[name]:.0f}", f"{paper / times[name]:.1f}", f"{rates[name]:.0f}"]
@@ -66,6 +76,7 @@ def experiment(out: Path, batch: int, repetitions: int, threads: int, seed: int)
             f"local ({case['segments_moved_by_a_key']} segments a key)" if case["local"] else "global",
             case["numbers_per_key"],
             case["derivatives"],
+            "-" if case["order"] is None else f"{case['order']:.1f}",
             f"{times[name]:.0f}",
         ]
         for name, case in measured.items()
@@ -83,8 +94,23 @@ def experiment(out: Path, batch: int, repetitions: int, threads: int, seed: int)
             ),
             Table(
                 "Overview, as measured",
-                ["method", "group", "keys", "continuity", "control", "numbers a key", "derivatives", "ns"],
+                [
+                    "method",
+                    "group",
+                    "keys",
+                    "continuity",
+                    "control",
+                    "numbers a key",
+                    "derivatives",
+                    "order",
+                    "ns",
+                ],
                 overview,
+            ),
+            Table(
+                f"A smooth motion in SE(3) followed to {tolerance:g} m and rad",
+                ["family", "order of convergence", "numbers", "ns for pose, velocity, acceleration"],
+                [[n, f"{x['order']:.1f}", x["numbers"], f"{x['ns']:.0f}"] for n, x in families.items()],
             ),
         ],
     )
@@ -96,6 +122,7 @@ def experiment(out: Path, batch: int, repetitions: int, threads: int, seed: int)
         "runtime_with_rates_ns": rates,
         "survey_ns": TABLE_2,
         "properties": measured,
+        "families": families,
     }
 
 

@@ -74,10 +74,10 @@ _PARTS = "Imu Magnetometer Barometer ImuNoise LowPass"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {"plain numbers or files": f"{_NUMBERS} {_FILES}"},
-    "dtype": {"plain numbers or files ": f"{_NUMBERS} {_FILES}"},
+    "dtype": {"plain numbers or files": f"{_NUMBERS} {_FILES}"},
     "device": {
         "parts wait for the first call": f"{_PARTS} ImuParameters LowPass.forward",
-        "plain numbers or files  ": f"{_NUMBERS} {_FILES}",
+        "plain numbers or files": f"{_NUMBERS} {_FILES}",
     },
     "nan": {"lost samples stay as they are": "Imu.correct"},
     "zero quaternion": {

@@ -23,10 +23,10 @@ _DONE = "AllanDeviation.bounds fit_noise"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "shape": {"computed before": _DONE},
-    "dtype": {"computed before ": _DONE},
+    "dtype": {"computed before": _DONE},
     "device": {"computed on the CPU": _DONE},
     "zero quaternion": {"records": f"allan_deviation {_DONE}"},
-    "time": {"no times     ": _DONE},
+    "time": {"no times": _DONE},
     "count": {"one number": "AllanDeviation.bounds"},
 }
 

@@ -25,7 +25,7 @@ NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "device": {"one argument": "earth_rate standard_pressure"},
     "zero quaternion": {"numbers": _ALL},
     "count": {"any number of places": _ALL},
-    "time": {"no times    ": _ALL},
+    "time": {"no times": _ALL},
 }
 
 

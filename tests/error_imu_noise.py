@@ -31,12 +31,12 @@ _NOISES = " ".join(NOISES)
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {"a whole number": "item_generator"},
-    "dtype": {"a whole number ": "item_generator"},
-    "device": {"a whole number  ": "item_generator"},
-    "nan": {"a whole number   ": "item_generator"},
+    "dtype": {"a whole number": "item_generator"},
+    "device": {"a whole number": "item_generator"},
+    "nan": {"a whole number": "item_generator"},
     "zero quaternion": {"no rotations": f"item_generator {_NOISES}"},
     "count": {"any number of samples": f"item_generator {_NOISES}"},
-    "time": {"no times   ": "item_generator white_noise"},
+    "time": {"no times": "item_generator white_noise"},
 }
 
 

@@ -69,11 +69,11 @@ _OTHERS = f"{_PRIORS} SlidingWindow.random_walk BatchResult.covariance"
 NOT_APPLICABLE = {
     "shape": {"plain numbers": f"{_UPDATES} SlidingWindow.extend BatchResult.covariance"},
     "dtype": {
-        "plain numbers ": f"{_UPDATES} SlidingWindow.extend BatchResult.covariance",
+        "plain numbers": f"{_UPDATES} SlidingWindow.extend BatchResult.covariance",
         "a spline was checked": "BatchProblem",
     },
     "device": {
-        "plain numbers  ": f"{_UPDATES} SlidingWindow.extend",
+        "plain numbers": f"{_UPDATES} SlidingWindow.extend",
         "solved on the CPU, where all comes together": f"{_ADD} {_OTHERS}",
     },
     "nan": {"what was checked when it was made": f"{_ADD} BatchProblem BatchResult.covariance"},
@@ -81,7 +81,7 @@ NOT_APPLICABLE = {
         "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} {_UPDATES} SlidingWindow.extend BatchProblem"
     },
     "count": {"any number": f"SlidingWindow.add {_OTHERS} {_UPDATES} SlidingWindow.extend"},
-    "time": {"no times  ": f"SlidingWindow BatchProblem {_OTHERS} {_UPDATES}"},
+    "time": {"no times": f"SlidingWindow BatchProblem {_OTHERS} {_UPDATES}"},
 }
 
 

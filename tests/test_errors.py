@@ -12,6 +12,8 @@ import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
 import error_online
+import error_robot
+import error_splines
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
@@ -23,8 +25,18 @@ from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.splines.trajectory import Mounted
 
-IMU = (error_imu_noise, error_imu_strapdown, error_imu_earth, error_imu_allan, error_imu)
-CASES = [*error_online.CASES, *(case for more in IMU for case in more.CASES)]
+#: Files of cases, each with `CASES` and `NOT_APPLICABLE`; arguments that are accepted register themselves.
+FILES = (
+    error_online,
+    error_imu_noise,
+    error_imu_strapdown,
+    error_imu_earth,
+    error_imu_allan,
+    error_imu,
+    error_robot,
+    error_splines,
+)
+CASES = [case for file in FILES for case in file.CASES]
 
 
 def label(case: Case) -> str:
@@ -74,7 +86,7 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem):
+    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_robot.ROOTS):
         visit(root)
     return found
 
@@ -95,12 +107,15 @@ RESULTS = {
     "Differentials",
     "Readings",
     "AmbientReadings",
+    *error_robot.RESULTS,
+    *error_splines.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
 UNTRIED = {
     "PoseFit.rms": "no arguments",
     "LowPass.extra_repr": "no arguments; PyTorch calls it",
+    **error_robot.UNTRIED,
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -225,9 +240,10 @@ NOT_APPLICABLE = {
     },
 }
 
-for _more in (error_online, *IMU):
+for _more in FILES:
     for _category, _reasons in _more.NOT_APPLICABLE.items():
-        NOT_APPLICABLE[_category].update(_reasons)
+        for _reason, _names in _reasons.items():  # the same reason may stand in several files
+            NOT_APPLICABLE[_category][_reason] = f"{NOT_APPLICABLE[_category].get(_reason, '')} {_names}"
 
 #: What counts as a case of the categories above.
 COUNTS_AS = {"batch": "shape", "mixed dtype": "dtype"}

@@ -12,14 +12,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from spline_cases import close
 from test_jet import derivatives_of
 
-import torchspline
 from torchspline import R3, SE3, SO3, Group, KeyframeSpline, Trajectory
 from torchspline.functional import interpolate, nonuniform_bspline
 from torchspline.groups import DualQuaternion, convert
 from torchspline.splines.interpolation import SCHEMES, SURVEY
 from torchspline.splines.interpolation.bezier import bernstein
 from torchspline.splines.interpolation.bsplines import knots_of, with_phantoms
-from torchspline.splines.interpolation.scheme import curve_kernel
 
 float64 = torch.float64
 EVEN = torch.arange(7, dtype=float64) - 1.0
@@ -429,33 +427,3 @@ def test_general_knots_agree_with_the_scheme():
     ours = interpolate("SpFus", keys, UNEVEN, T)
     assert kit.equal_up_to_sign(SE3, ours.value, expected.value) < 100
     assert all(close(a, b, 1e-12) for a, b in zip(ours[1:3], expected[1:3], strict=True))
-
-
-# ---------------------------------------------------------------------- kernels
-
-
-@pytest.mark.parametrize(
-    ("name", "derivatives"), [("QLB", 2), ("DLFus", 0), ("SQUAD", 0), ("SLERP", 2), ("CuBsp", 0)], ids=str
-)
-@kit.each_dtype
-def test_kernels_equal_the_reference(name, derivatives, dtype):
-    """Values, rates, gradients and gradients of gradients on as many queries as kernels are compiled for."""
-    pytest.importorskip("numba")
-    group, results = group_of(name), []
-    t = torch.linspace(-1.0, 5.0, 5001, dtype=float64)
-    for mode in ("auto", "reference"):
-        keys = group.normalize(keyframes(group)).to(dtype).requires_grad_()
-        with torchspline.use_kernels(mode):
-            state = interpolate(name, keys, UNEVEN, t, derivatives)
-            fields = torch.cat(state[: derivatives + 1], dim=-1)
-            loss = (fields * torch.linspace(0, 1, 5001, dtype=dtype)[:, None]).square().mean()
-            (gradient,) = torch.autograd.grad(loss, keys, create_graph=True)
-            (second,) = torch.autograd.grad(gradient.square().sum(), keys)
-        results.append((fields, gradient, second))
-    for ours, theirs in zip(*results, strict=True):
-        assert close(ours, theirs, 1e-12 if dtype == float64 else 2e-4)
-
-
-def test_long_curves_are_not_compiled():
-    assert curve_kernel(SCHEMES["linear"], "SO3", 8, 2, float64) is not None
-    assert curve_kernel(SCHEMES["bezier"], "SE3", 70, 2, float64) is None

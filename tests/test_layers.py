@@ -20,7 +20,8 @@ LAYERS = [
     {"splines"},
     {"imu"},
     {"fit"},
-    {"functional", "robot", "io", "plot"},
+    {"functional", "robot", "people", "io", "plot"},
+    {"view", "explore"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

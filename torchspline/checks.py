@@ -36,6 +36,18 @@ def is_floating_tensor(name: str, x: object) -> Tensor:
     return x
 
 
+def is_times(name: str, x: object) -> Tensor:
+    """`x` itself if it holds times: floating seconds, or whole nanoseconds (int64)."""
+    if isinstance(x, Tensor) and x.dtype == torch.int64:
+        return x
+    if isinstance(x, Tensor) and x.dtype not in (torch.float32, torch.float64):
+        raise TypeError(
+            f"{name}: expected dtype torch.float32 or torch.float64 (seconds) or torch.int64 (nanoseconds), "
+            f"got {x.dtype}"
+        )
+    return is_floating_tensor(name, x)
+
+
 def has_last(name: str, x: Tensor, size: int, meaning: str) -> Tensor:
     """`x` itself if its last dimension is `size`."""
     if x.ndim == 0 or x.shape[-1] != size:

@@ -28,13 +28,13 @@ def sweep_tables(title: str, rows: Sequence[dict[str, Any]]) -> list[Table]:
         lines = []
         for name in names:
             found = (cells.get((name, x)) for x in places)
-            lines.append([name, *("-" if row is None else _pair(row) for row in found)])
+            lines.append([name, *("-" if row is None else pair(row) for row in found)])
         header = ["", *(x if isinstance(x, str) else f"{x:,}" for x in places)]
         tables.append(Table(f"{title}; {sweep}: ns per query, min (median)", header, lines))
     return tables
 
 
-def _pair(row: dict[str, Any]) -> str:
+def pair(row: dict[str, Any]) -> str:
     return f"{number(row['ns_per_query_min'])} ({number(row['ns_per_query_median'])})"
 
 
@@ -128,7 +128,7 @@ def draw_goals(rows: Sequence[dict[str, Any]]) -> Figure:
 
 def operations_table(rows: Sequence[dict[str, Any]]) -> Table:
     lines = [
-        [row["operation"], row["threads"], row["contender"], _pair(row), f"{row['busy']:.2f}"] for row in rows
+        [row["operation"], row["threads"], row["contender"], pair(row), f"{row['busy']:.2f}"] for row in rows
     ]
     return Table(
         "Group operations, forward + backward: ns each, min (median)",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from common import Table
 from matplotlib.figure import Figure
 
-from bench import goals, operations, ours, plots, processes, sweeps
+from bench import goals, jacobians, operations, ours, plots, processes, sweeps
 from bench.contenders import CONTENDERS
 from bench.operations import LIBRARIES, OPERATIONS, Operation
 from bench.problems import Problem
@@ -98,6 +98,26 @@ def _operations(plan: Plan) -> Report:
     return Report([agreement, plots.operations_table(rows)], record, plots.draw_operations(rows))
 
 
+def _jacobians(plan: Plan) -> Report:
+    orders = [k for k in (4, 5, 6) if k <= max(plan.sizes.orders)]
+    rows = jacobians.evaluate(orders, plan.sizes.base // 10, plan.rounds, plan.patience, plan.notes)
+    cells = {(row["group"], row["contender"], row["order"]): row for row in rows}
+    names = list(dict.fromkeys((row["group"], row["contender"]) for row in rows))
+    lines = [[f"{group}: {who}", *(plots.pair(cells[group, who, k]) for k in orders)] for group, who in names]
+    for group in jacobians.GROUPS:
+        quoted = [jacobians.QUOTED.get((group, k)) for k in orders]
+        if any(quoted):
+            lines.append(
+                [f"{group}: C++, quoted, another machine", *("-" if x is None else x for x in quoted)]
+            )
+    title = (
+        "Jacobians of value, velocity and acceleration by control points; orders: ns per query, min (median)"
+    )
+    apart = max((row["deviation"] for row in rows), default=0.0)
+    agreement = Table("Jacobians: largest deviation from forward mode", ("deviation",), [[f"{apart:.1e}"]])
+    return Report([agreement, Table(title, ["", *(f"{k}" for k in orders)], lines)], rows)
+
+
 def _processes(plan: Plan) -> Report:
     rounds = min(plan.rounds, 5)
     samples = {"import beyond torch": processes.imports(rounds), **processes.first_calls(rounds)}
@@ -115,5 +135,6 @@ SECTIONS: dict[str, Callable[[Plan], Report]] = {
     **{name: partial(_sweep, name) for name in SWEEPS},
     "latency": _latency,
     "operations": _operations,
+    "jacobians": _jacobians,
     "processes": _processes,
 }

@@ -1,5 +1,6 @@
 """Figures 1 to 6 of [H18], redrawn."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ from torchspline.splines.interpolation.bezier import bernstein
 
 PLANE = Group("R2")
 COLOURS = ("tab:red", "tab:green", "tab:blue", "tab:orange")
+SEGMENTS = ("tab:red", "tab:orange", "tab:olive", "tab:green", "tab:blue", "tab:purple")
+#: Colours of the frames between two keys, as in the paper's Figure 5.
+BETWEEN = ("tab:red", "tab:green", "tab:blue", "gold")
 
 
 def _lines(ax: Any, points: Tensor, **style: Any) -> None:
@@ -43,6 +47,7 @@ def figure_1(out: Path) -> Path:
         for i, weight in enumerate(bernstein(degree, u)):
             ax.plot(*control[i], "o", color=COLOURS[i])
             basis_ax.plot(u, weight, color=COLOURS[i])
+            basis_ax.plot(0.75, weight[75], "o", color=COLOURS[i])
         basis_ax.axvline(0.75, color="0.6")
         ax.set(title=f"degree {degree}, u = 0.75")
         basis_ax.set(xlabel="u", ylabel="Bernstein polynomials")
@@ -61,38 +66,61 @@ def figure_2(out: Path) -> Path:
             for j, piece in enumerate(reversed(pieces)):
                 ax.plot(u + i - degree + j, piece, color=COLOURS[i])
         ax.axvspan(0, 1, color="0.9")
-        ax.set(title=f"degree {degree}", xlabel="knots", ylim=(0, 1.05))
+        ax.set(title=f"degree {degree}", xlabel="knots", ylabel="basis functions" if degree == 1 else "")
+        ax.set(xlim=(-3.2, 4.2), ylim=(0, 1.05), xticks=range(-3, 5))
     return save(figure, out / "figure_2.png")
 
 
 def figure_3(out: Path) -> Path:
-    """Seven control points: a composite cubic Bezier curve and a cubic B-spline, and what one moved point does."""
+    """Seven control points: a composite cubic Bezier curve and a cubic B-spline, what one moved point does (dashed),
+    and what each point weighs in each segment, shaded in the colour of its piece of the curve."""
     x = torch.arange(7, dtype=DOUBLE)
     points = torch.stack([x, torch.tensor([0.0, 1.0, 0.2, 1.2, 0.1, 0.9, 0.3], dtype=DOUBLE)], dim=-1)
     moved = points.clone()
     moved[3, 1] += 0.8
-    t = torch.linspace(0, 6, 601, dtype=DOUBLE)
     figure = Figure(figsize=(12, 7), layout="constrained")
-    axes = figure.subplots(2, 2)
+    axes = figure.subplots(2, 2, sharey="row")
     for column, (name, title) in enumerate(
         (
             ("CompositeBezier", "composite cubic Bezier: interpolates, global"),
             ("BSpline", "cubic B-spline: local, approximates"),
         )
     ):
-        for keys, style in ((points, "-"), (moved, "--")):
-            _lines(axes[0, column], interpolate(name, keys, x, t, 0).value, color="black", linestyle=style)
-            axes[0, column].plot(
-                keys[:, 0], keys[:, 1], "o", color="tab:red" if style == "--" else "tab:blue"
-            )
-        axes[0, column].set(title=title)
+        top, bottom = axes[:, column]
+        t = torch.linspace(0, 6, 601, dtype=DOUBLE)
+        _lines(top, interpolate(name, moved, x, t, 0).value, color="0.5", linestyle="--")
+        for i, colour in enumerate(SEGMENTS):
+            part = t[100 * i : 100 * i + 101]
+            _lines(top, interpolate(name, points, x, part, 0).value, color=colour, linewidth=2.5)
+            bottom.axvspan(i, i + 1, color=colour, alpha=0.15, linewidth=0)
+        top.plot(moved[3, 0], moved[3, 1], "o", color="white", markeredgecolor="black")
+        top.plot(points[:, 0], points[:, 1], "o", color="black")
+        top.set(title=title)
         unit = torch.eye(7, dtype=DOUBLE)
-        weights = interpolate(
-            "bspline" if name == "BSpline" else "composite_bezier", unit, x, t, 0, group=Group("R7")
+        scheme = "bspline" if name == "BSpline" else "composite_bezier"
+        bottom.plot(
+            t, interpolate(scheme, unit, x, t, 0, group=Group("R7")).value, color="black", linewidth=1
         )
-        axes[1, column].plot(t, weights.value)
-        axes[1, column].set(title="weight of each control point", xlabel="knots")
+        bottom.set(title="weight of each control point", xlabel="knots")
     return save(figure, out / "figure_3.png")
+
+
+def _on_the_sphere(ax: Any, q: Tensor, keys: Tensor, title: str) -> None:
+    """The hemisphere w > 0 seen from above; what is drawn last lies on top."""
+    ax.computed_zorder = False
+    turn, down = torch.meshgrid(
+        torch.linspace(0, 2 * torch.pi, 37), torch.linspace(0, torch.pi / 2, 10), indexing="ij"
+    )
+    sphere = torch.sin(down) * torch.cos(turn), torch.sin(down) * torch.sin(turn), torch.cos(down)
+    ax.plot_wireframe(*(x.numpy() for x in sphere), color="0.85", linewidth=0.5)
+    ax.plot(q[:, 1], q[:, 2], q[:, 0], color="black")
+    for i, key in enumerate(keys):
+        ax.scatter(key[1], key[2], key[0], color=f"C{i}", s=40, depthshade=False)
+        ax.text(key[1] + 0.1, key[2] + 0.08, key[0], str(i), color=f"C{i}")
+    ax.set(title=title, xlabel="x", ylabel="y", xticks=(-1, 0, 1), yticks=(-1, 0, 1), zticks=())
+    ax.set_box_aspect((1, 1, 0.5), zoom=1.2)
+    ax.set_proj_type("ortho")
+    ax.view_init(elev=70, azim=-90)
 
 
 def figure_4(out: Path) -> dict[str, float]:
@@ -102,35 +130,20 @@ def figure_4(out: Path) -> dict[str, float]:
     t = torch.linspace(0, 5, 1001, dtype=DOUBLE)
     figure = Figure(figsize=(16, 8), layout="constrained")
     jumps = {}
-    a, b = torch.linspace(0, torch.pi, 30), torch.linspace(0, torch.pi, 30)
+    jumps, speeds = {}, []
     for i, name in enumerate(("SLERP", "SQUAD", "RQBez", "CuBsp")):
         state = interpolate(name, keys, times, t, 2)
         assert state.velocity is not None
-        speed = state.velocity.norm(dim=-1)
-        sphere = figure.add_subplot(2, 4, i + 1, projection="3d")
-        q = state.value
-        unit = (
-            keys
-            * torch.where((keys * interpolate(name, keys, times, times, 0).value).sum(-1) < 0, -1.0, 1.0)[
-                :, None
-            ]
+        side = torch.where((keys * interpolate(name, keys, times, times, 0).value).sum(-1) < 0, -1.0, 1.0)
+        _on_the_sphere(
+            figure.add_subplot(2, 4, i + 1, projection="3d"), state.value, keys * side[:, None], name
         )
-        rings = torch.cos(a)[:, None], torch.sin(a)[:, None]
-        sphere.plot_wireframe(
-            (rings[1] * torch.sin(b)).numpy(), (rings[0] * torch.ones_like(b)).numpy(), (rings[1] *
-            torch.cos(b)).numpy(),
-            color="0.9", linewidth=0.5,
-        )  # fmt: skip
-        sphere.plot(q[:, 1], q[:, 2], q[:, 0], color="black")
-        sphere.scatter(unit[:, 1], unit[:, 2], unit[:, 0], c=range(6), cmap="tab10")
-        sphere.set(title=name, xlabel="x", ylabel="y", zlabel="w")
-        sphere.set_box_aspect((1, 1, 1))
-        sphere.view_init(elev=60, azim=-70)
-        ax = figure.add_subplot(2, 4, i + 5)
-        ax.plot(t, speed)
+        ax = figure.add_subplot(2, 4, i + 5, sharey=speeds[0] if speeds else None)
+        speeds.append(ax)
+        ax.plot(t, state.velocity.norm(dim=-1))
         for key in times:
             ax.axvline(float(key), color="0.85")
-        ax.set(xlabel="keys", ylabel="angular velocity [rad/s]" if i == 0 else "", ylim=(0, None))
+        ax.set(xlabel="keys", ylabel="angular velocity [rad/s]" if i == 0 else "", ylim=(0, 4.2))
         sides = [interpolate(name, keys, times, times[1:-1] + s * 1e-7, 1).velocity for s in (-1, 1)]
         assert sides[0] is not None
         assert sides[1] is not None
@@ -147,15 +160,13 @@ def _positions(name: str, poses: Tensor, times: Tensor, t: Tensor) -> tuple[Tens
     return convert.pose_from_dual_quaternion(state.value) if dual else state.value, state
 
 
-def _path(ax: Any, poses: Tensor, colour: str, label: str, axes_every: int = 0, **style: Any) -> None:
-    """Positions in the y-z plane; the body's z axis (a camera's direction) here and there."""
-    ax.plot(poses[:, 1], poses[:, 2], color=colour, label=label, **style)
-    if axes_every:
-        shown = poses[::axes_every]
-        z = SO3.act(shown[:, 3:], torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE))
-        ax.quiver(
-            shown[:, 1], shown[:, 2], z[:, 1], z[:, 2], color=colour, angles="xy", scale=14, width=0.004
-        )
+def _frames(ax: Any, poses: Tensor, colours: Sequence[str], length: float, **style: Any) -> None:
+    """Positions in the y-z plane and the body's y and z axes (a camera looks along z)."""
+    for pose, colour in zip(poses, colours, strict=True):
+        ax.plot(pose[1], pose[2], color=colour, linestyle="none", **style)
+        for axis, width in (((0.0, 0.0, 1.0), 2.0), ((0.0, 1.0, 0.0), 1.0)):
+            tip = pose[:3] + length * SO3.act(pose[3:], torch.tensor(axis, dtype=DOUBLE))
+            ax.plot([pose[1], tip[1]], [pose[2], tip[2]], color=colour, linewidth=width)
 
 
 def figure_5_drawn(out: Path) -> dict[str, float]:
@@ -165,25 +176,34 @@ def figure_5_drawn(out: Path) -> dict[str, float]:
     figure = Figure(figsize=(12, 6), layout="constrained")
     ax, speed_ax = figure.subplots(1, 2)
     paths = {}
-    for name, colour in (
-        ("SPLIT", "tab:orange"),
-        ("SE3Up", "tab:purple"),
-        ("ScLERP", "tab:pink"),
-        ("DLB", "tab:green"),
+    for name, colour, style, marker in (
+        ("SPLIT", "tab:orange", "-", "o"),
+        ("SE3Up", "tab:purple", "-", "o"),
+        ("ScLERP", "tab:pink", "--", ""),
+        ("DLB", "tab:green", ":", "s"),
     ):
         paths[name], state = _positions(name, poses, times, t)
         assert state.velocity is not None
         speed = state.velocity[:, 3:].norm(dim=-1)
-        _path(ax, paths[name], colour, name, axes_every=20, linestyle="--" if name == "DLB" else "-")
-        speed_ax.plot(t, speed, color=colour, label=name, linestyle="--" if name == "ScLERP" else "-")
+        ax.plot(paths[name][:, 1], paths[name][:, 2], color=colour, label=name, linestyle=style)
+        if marker:
+            small = {"marker": marker, "markersize": 4 if name == "DLB" else 8}
+            _frames(ax, paths[name][20:81:20], BETWEEN, 0.08 if name == "DLB" else 0.16, **small)
+        speed_ax.plot(t, speed, color=colour, label=name, linestyle="-" if name == "DLB" else style)
         if name == "DLB":
             bell = speed
-    _path(ax, poses, "black", "keys", axes_every=1, linestyle="none", marker="o")
-    ax.set(xlabel="y [m]", ylabel="z [m]", aspect="equal", title="half-circle of SE3Up, ScLERP and DLB")
-    speed_ax.set(xlabel="u", ylabel="angular velocity [rad]", title="bell-shaped speed of DLB")
-    ax.legend()
+    _frames(ax, poses, ("black", "black"), 0.16, marker="o", label="keys")
+    ax.set(xlabel="y [m]", ylabel="z [m]", aspect="equal", xlim=(-0.5, 1.3), ylim=(-1.25, 1.25))
+    ax.set(title="frames at u = 0.2 ... 0.8, those of DLB small")
+    speed_ax.set(xlabel="u", ylabel="angular velocity [rad per unit of u]", title="bell-shaped speed of DLB")
+    handles = dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    ax.legend(handles.values(), handles.keys(), loc="center", bbox_to_anchor=(0.5, 0.5))
     speed_ax.legend()
     save(figure, out / "figure_5.png")
+
+    def angle(pose: Tensor) -> Tensor:
+        return torch.atan2(pose[1], -pose[2])
+
     radius = paths["SE3Up"][:, :3].norm(dim=-1)
     return {
         "largest_deviation_of_SE3Up_from_SPLIT_m": float(
@@ -192,6 +212,12 @@ def figure_5_drawn(out: Path) -> dict[str, float]:
         "distance_of_SE3Up_from_the_half_circle_m": float((radius - 1).abs().max()),
         "distance_of_ScLERP_from_SE3Up_m": float((paths["ScLERP"] - paths["SE3Up"])[:, :3].abs().max()),
         "distance_of_DLB_from_the_half_circle_m": float((paths["DLB"][:, :3].norm(dim=-1) - 1).abs().max()),
+        **{
+            f"angle_of_DLB_ahead_of_SE3Up_at_{u / 100}_rad": float(
+                angle(paths["DLB"][u]) - angle(paths["SE3Up"][u])
+            )
+            for u in (20, 40, 60, 80)
+        },
         "speed_of_DLB_at_its_ends_rad": float(bell[0]),
         "speed_of_DLB_in_the_middle_rad": float(bell[50]),
         "speed_of_ScLERP_rad": float(torch.pi),
@@ -210,8 +236,13 @@ def figure_6_drawn(out: Path) -> dict[str, float]:
         ("DLFus", "tab:olive"),
     ):  # fmt: skip
         paths[name], _ = _positions(name, poses, times, t)
-        _path(ax, paths[name], colour, name, linestyle="--" if name == "DLFus" else "-")
-    _path(ax, poses, "black", "keys", axes_every=1, linestyle="none", marker="o")
+        style = (
+            {"linestyle": "--"}
+            if name in ("DLFus", "SE3Up")
+            else {"linewidth": 2.5 if name == "SPLIT" else 1.5}
+        )
+        ax.plot(paths[name][:, 1], paths[name][:, 2], color=colour, label=name, **style)
+    _frames(ax, poses, ("black",) * 4, 0.1, marker="o")
     ax.set(xlabel="y [m]", ylabel="z [m]", aspect="equal", title="joint and split trajectories")
     ax.legend()
     save(figure, out / "figure_6.png")

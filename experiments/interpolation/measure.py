@@ -43,6 +43,13 @@ def properties(name: str, seed: int) -> dict[str, Any]:
             break
         continuous += 1
 
+    # The square of a velocity's length between keys, in units of the largest.
+    within = torch.linspace(0.1, 0.9, 9, dtype=DOUBLE)
+    rates = spline.evaluate((times[:-1, None] + within).flatten(), 1).velocity
+    assert rates is not None
+    speeds = rates.square().sum(-1).reshape(KEYS - 1, -1)
+    uneven = (speeds.amax(-1) - speeds.amin(-1)).max() / speeds.max()
+
     middle = KEYS // 2
     moved = keys.clone()
     moved[middle] = group.compose(
@@ -57,7 +64,9 @@ def properties(name: str, seed: int) -> dict[str, Any]:
         "interpolates": miss < 1e-12,
         "miss_at_keys": miss,
         "continuous_derivatives": continuous,
+        "constant_speed": bool(uneven < 1e-9),
         "segments_moved_by_a_key": segments,
+        "segments": KEYS - 1,
         "local": segments < KEYS - 1,
         "numbers_per_key": group.point_size,
         "derivatives": 3,

@@ -127,8 +127,9 @@ def reverse(
     value_cotangent: Vector,
     rate_cotangents: Sequence[Vector],
     short: bool = False,
+    steps_move: bool = True,
 ) -> tuple[Vector, list[Vector], list[list[Scalar]]]:
-    """Reverse sweep: cotangents of start (body frame), of every step and of every weight.
+    """Reverse sweep: cotangents of start (body frame), of every step (if `steps_move`) and of every weight.
 
     Perturbing `A_j -> A_j Exp(eta)` moves the value by eta and each carried rate c by [c, eta]; then eta itself is
     `l_j J_r(l_j d_j)` of the change of d_j, plus d_j times the change of l_j. Everything else is linear. The
@@ -141,8 +142,9 @@ def reverse(
         d, l, step = steps[j], [row[j] for row in weights], trace[j]
         d_g, l_g, eta_g = _reverse_step(group, d, l, step, rates_g)
         eta_g = add(g, eta_g)
-        through_exp = group.right_jacobian_transpose(scale(l[0], d), eta_g, short)
-        steps_g[j] = add(d_g, scale(l[0], through_exp))
+        if steps_move:
+            through_exp = group.right_jacobian_transpose(scale(l[0], d), eta_g, short)
+            steps_g[j] = add(d_g, scale(l[0], through_exp))
         l_g[0] = plus(l_g[0], dot(d, eta_g))
         for row, component in zip(weights_g, l_g, strict=True):
             row[j] = component

@@ -3,6 +3,7 @@
 import platform
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -110,8 +111,8 @@ def _calls(queries: int, seed: int) -> dict[str, tuple[Callable[[], Any], str, i
 
     calls: dict[str, tuple[Callable[[], Any], str, int]] = {}
     for name, spline in splines.items():
-        calls[f"{name}: value, velocity, acceleration"] = ((lambda s=spline: forward(s)), "query", queries)
-        calls[f"{name}: the same and all gradients"] = ((lambda s=spline: both(s)), "query", queries)
+        calls[f"{name}: value, velocity, acceleration"] = (partial(forward, spline), "query", queries)
+        calls[f"{name}: the same and all gradients"] = (partial(both, spline), "query", queries)
     calls["IMU readings"] = (inertial, "reading", queries)
     few = torch.arange(0, 1200, dtype=torch.float64) / 120
     with torch.no_grad():

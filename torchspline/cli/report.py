@@ -39,7 +39,7 @@ class Report:
                 table.add_row(*row)
             console.print(table)
         for note in self.notes:
-            console.print(f"note: {note}", markup=False, highlight=False)
+            console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
         if self.files:
             folders = {path.parent for path in self.files}
             if len(folders) == 1:

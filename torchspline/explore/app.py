@@ -1,9 +1,11 @@
 """The window on an `Explorer`: a page that viser serves to the browser."""
 
 import io
+import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,10 @@ class App:
     def __init__(self, explorer: Explorer, host: str = "127.0.0.1", port: int = 8080):
         library = viser()
         self.explorer = explorer
-        self.server = library.ViserServer(host=host, port=port, label="torchspline explore", verbose=False)
+        with redirect_stdout(sys.stderr):  # it announces itself; standard output is for results
+            self.server = library.ViserServer(
+                host=host, port=port, label="torchspline explore", verbose=False
+            )
         self.url = f"http://{host}:{self.server.get_port()}"
         self.controls: list[Any] = []
         self.boxes: dict[str, Any] = {}
@@ -50,6 +55,10 @@ class App:
         self._drawn: list[Any] = []
         self._busy, self._again = threading.Lock(), False
         self.server.scene.set_up_direction("+z")
+        keys = numbers(explorer.keyframes)[:, :3]
+        centre, size = keys.mean(axis=0), max(float(np.ptp(keys, axis=0).max()), 1e-3)
+        self.server.initial_camera.position = tuple(centre + size * np.array([0.9, -1.6, 1.1]))
+        self.server.initial_camera.look_at = tuple(centre)
         self.server.scene.add_grid("/ground", width=20.0, height=20.0, cell_size=0.5)
         self._make_gui()
         self._place_controls()
@@ -57,30 +66,31 @@ class App:
 
     def stop(self) -> None:
         """Close the server."""
-        self.server.stop()
+        with redirect_stdout(sys.stderr):
+            self.server.stop()
 
     # ------------------------------------------------------------------ the panel beside the scene
 
     def _make_gui(self) -> None:
         gui = self.server.gui
-        self.status = gui.add_markdown("")
-        with gui.add_folder("View"):
+        self.status = gui.add_markdown("", order=0.0)
+        with gui.add_folder("View", order=0.1):
             self.apart = gui.add_checkbox("side by side", False, hint="one curve beside the other")
             self.frames = gui.add_slider("frames", 0, 60, 1, 12)
             self.moment = gui.add_slider("moment", 0.0, 1.0, 0.002, 0.0, hint="share of the duration")
-        with gui.add_folder("Keyframes"):
+        with gui.add_folder("Keyframes", order=0.2):
             add, remove = gui.add_button("add"), gui.add_button("remove the last")
             upload = gui.add_upload_button("load a file", hint="poses (TUM, EuRoC) or a trajectory (.npz)")
             self.count = gui.add_slider("keyframes out of a file", 2, 40, 1, 8)
-        export = gui.add_button("export the figure")
-        with gui.add_folder("Methods"):
+        export = gui.add_button("export the figure", order=0.3)
+        with gui.add_folder("Methods", order=0.4):
             for title, names in _by_group().items():
                 with gui.add_folder(title, expand_by_default=title == "R3xSO3"):
                     for name in names:
                         self.boxes[name] = gui.add_checkbox(name, name in self.explorer.methods)
                         self.boxes[name].on_update(self._chosen)
-        self.plots = gui.add_folder("Lengths over time")
-        self.basis_folder = gui.add_folder("Basis functions")
+        self.plots = gui.add_folder("Over time", order=0.5)
+        self.basis_folder = gui.add_folder("Basis functions", order=0.6)
         with self.basis_folder:
             self.basis_of = gui.add_dropdown(
                 "method",
@@ -252,14 +262,16 @@ class App:
 
 
 def _by_group() -> dict[str, list[str]]:
-    """Names of methods by what they work in, poses first."""
-    found: dict[str, list[str]] = {name: [] for name in ("R3xSO3", "SE3", "DualQuaternion", "R3", "SO3")}
-    for method in METHODS:
-        found[resolve(method)[1]].append(method)
+    """Names of methods by what they work in: those of [H18] for poses first, then the rest."""
+    survey = ("R3xSO3", "SE3", "DualQuaternion")
     titles = {"R3": "positions alone", "SO3": "rotations alone"}
-    return {
-        titles.get(name, name): sorted(names, key=lambda x: x not in SURVEY) for name, names in found.items()
+    found: dict[str, list[str]] = {
+        name: [] for name in (*survey, *titles.values(), "every scheme on every group")
     }
+    for method in METHODS:
+        group = resolve(method)[1]
+        found[titles.get(group, group) if method in SURVEY else "every scheme on every group"].append(method)
+    return found
 
 
 def _color(i: int) -> str:

@@ -196,7 +196,8 @@ class Explorer:
         if not found:
             raise ValueError("methods: expected at least one that makes a curve of the keyframes, got none")
         figure = new_figure(15, 9)
-        left, right = figure.subfigures(1, 2, width_ratios=[1.1, 1.0])
+        halves: Any = figure.subfigures(1, 2, width_ratios=[1.1, 1.0])
+        left, right = halves
         axes: Any = left.add_subplot(projection="3d")
         keys = numbers(self.keyframes[:, :3])
         axes.plot(*keys.T, "o", color="black", markersize=4, label="keys")

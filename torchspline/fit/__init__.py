@@ -1,6 +1,7 @@
 """Trajectories and sensor parameters from measurements."""
 
 from torchspline.fit.align import Alignment, align_imu
+from torchspline.fit.approximation import Approximation, Difference, approximate, compare
 from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
 from torchspline.fit.online import SlidingWindow
 from torchspline.fit.poses import PoseFit, fit_poses
@@ -34,11 +35,13 @@ __all__ = [
     "Accelerometer",
     "Alignment",
     "AngularAcceleration",
+    "Approximation",
     "BatchProblem",
     "BatchResult",
     "BodyVelocity",
     "Cauchy",
     "Clock",
+    "Difference",
     "Direction",
     "GemanMcClure",
     "Gyroscope",
@@ -63,6 +66,8 @@ __all__ = [
     "Variable",
     "WorldVelocity",
     "align_imu",
+    "approximate",
+    "compare",
     "fit_poses",
     "smoothness",
 ]

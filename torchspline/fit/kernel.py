@@ -120,7 +120,7 @@ class ResidualKernel:
             arrays: (N, size) for each of `sizes`, then (size,) for each shared argument.
         """
         N, R = arrays[0].shape[0], self.rows
-        if fused:
+        if fused and self.kind.compiled:
             outputs = [np.empty((N, size)) for size in self.results]
             flat = [np.ascontiguousarray(x).reshape(-1) for x in arrays]
             self._compiled(flat, [x.reshape(-1) for x in outputs], N)

@@ -129,6 +129,8 @@ class Residual(ABC):
     #: Ranges of the components of what is measured that are quaternions.
     measured_signs: ClassVar[tuple[tuple[int, int], ...]] = ()
     slots: ClassVar[Mapping[str, Slot]] = {}
+    #: Whether its loops are compiled; with very many operations tensors are quicker than waiting for that.
+    compiled: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Reading and writing recordings: `read_poses`, `read_imu`, `write_poses`, `write_imu`.
+"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`.
 
 Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`. Bags of
 ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from torchspline.io import euroc, kitti, ros, tum
+from torchspline.io.bvh import Skeleton, read_bvh
 from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
 from torchspline.io.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchspline.io.records import ImuRecord, PoseRecord
@@ -22,7 +23,9 @@ __all__ = [
     "ImuParameters",
     "ImuRecord",
     "PoseRecord",
+    "Skeleton",
     "load_trajectory",
+    "read_bvh",
     "read_imu",
     "read_imu_parameters",
     "read_nerfstudio",

@@ -105,24 +105,28 @@ def emit_rows(
         scatter += [f"{array}[(block + i) * {size} + {c}] = Y[{(row + c) * BLOCK} + i]" for c in range(size)]
         row += size
     scatter.append(f"refused += Y[{row * BLOCK} + i] != 0.0")
-    again = []
-    if far is not None:
-        guard = len(near.outputs) - 1
-        again = [
-            "beyond = False",
-            "for i in range(n):",
-            f"    beyond |= Y[{guard * BLOCK} + i] != 0.0",
-            "if beyond:",
-            *(f"    {line}" for line in _middle(far, dtype == torch.float32)),
-        ]
     parts = {
         "before": before,
         "gather": gather,
-        "again": again,
+        "again": _again(near, far, dtype),
         "scatter": scatter,
         "after": ["return refused"],
     }
     return _source(name, [*ins, *outs, "begin", "stop"], near, dtype, parts, _EXACT)
+
+
+def _again(near: Trace, far: Trace | None, dtype: torch.dtype) -> list[str]:
+    """The far program over a block where the last output of the near one says that it does not hold."""
+    if far is None:
+        return []
+    guard = len(near.outputs) - 1
+    return [
+        "beyond = False",
+        "for i in range(n):",
+        f"    beyond |= Y[{guard * BLOCK} + i] != 0.0",
+        "if beyond:",
+        *(f"    {line}" for line in _middle(far, dtype == torch.float32)),
+    ]
 
 
 def emit_pairs(
@@ -236,6 +240,59 @@ _KEEP = ["bases[i] = base", "same = base == bases[0] and (same or i == 0)"]
 _CLOCK = ["times", "shared", "t0", "dt", "tolerance", "segments", "points", "queries"]
 _SPAN = ["begin", "stop"]
 _START = ["outside = 0", "row = begin // queries", "column = begin % queries"]
+
+
+def emit_curve(
+    name: str, near: Trace, far: Trace | None, columns: int, results: list[int], dtype: torch.dtype
+) -> str:
+    """`name(table, knots, times, start, end, out0, ..., begin, stop)`: a curve made of segments, row s of the table
+    (of so many columns) telling what it is between knots s and s + 1. Returns how many times lie
+    outside of start and end.
+
+    Program inputs: u within the segment, one over its duration, the row. Neighbouring times mostly share a segment;
+    where they do not, it is found by bisection. Near and far programs as in `emit_rows`.
+    """
+    outs = [f"out{i}" for i in range(len(results))]
+    gather = [
+        "s = times[block + i]",
+        "if not (s >= first and s < second):",
+        "    segment, above = 0, last + 1",
+        "    while above - segment > 1:",
+        "        middle = (segment + above) // 2",
+        "        if s >= knots[middle]:",
+        "            segment = middle",
+        "        else:",
+        "            above = middle",
+        "    first, second = knots[segment], knots[segment + 1]",
+        "    inverse = 1.0 / (second - first)",
+        "if not (s >= start and s <= end):",
+        "    outside += 1",
+        "X[i] = real((s - first) * inverse)",
+        f"X[{BLOCK} + i] = real(inverse)",
+        "base = segment",
+        *_KEEP,
+    ]
+    scatter, row = list[str](), 0
+    for array, size in zip(outs, results, strict=True):
+        scatter.append(_at(array, "(block + i)", size))
+        scatter += [f"{array}[{array}_at + np.uint64({c})] = Y[{(row + c) * BLOCK} + i]" for c in range(size)]
+        row += size
+    parts = {
+        "before": [
+            "outside, segment, last = 0, 0, len(knots) - 2",
+            "while last > 0 and knots[last] == knots[last + 1]:",  # knots may come more than once
+            "    last -= 1",
+            "first, second, inverse = np.inf, np.inf, 0.0",
+            *_BASES,
+        ],
+        "gather": gather,
+        "copy": _copy([("table", columns, columns)], 2),
+        "again": _again(near, far, dtype),
+        "scatter": scatter,
+        "after": ["return outside"],
+    }
+    parameters = ["table", "knots", "times", "start", "end", *outs, *_SPAN]
+    return _source(name, parameters, near, dtype, parts, _EXACT)
 
 
 class SplineLayout(NamedTuple):

@@ -11,6 +11,7 @@ Two curves between the same ends, the same on a commutative group:
 which is [E17] applied to the inverse motion. `frame="world"` is [E17] to the letter.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 from math import factorial
 from typing import Literal, NamedTuple
@@ -20,8 +21,10 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.arithmetic import jet
+from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES, difference_reverse, forward, reverse
-from torchspline.arithmetic.vector import Vector, add, scale, zero
+from torchspline.arithmetic.scalar import Scalar
+from torchspline.arithmetic.vector import Vector, add, plus, scale, times, zero
 from torchspline.groups.components import join, split
 from torchspline.groups.group import Group, Side
 from torchspline.groups.operations import geodesics
@@ -29,6 +32,7 @@ from torchspline.splines.clock import Extrapolate
 from torchspline.splines.segments import (
     check_knot_times,
     check_query,
+    durations,
     evaluate_segments,
     locate_between,
     rows_at,
@@ -89,7 +93,7 @@ def _ends(values: Tensor, velocities: Tensor, accelerations: Tensor, times: Tens
     unit = algebra.normalize(split(values))
     between = algebra.between(first(unit), second(unit))
     points = join(continue_signs(algebra, unit, between), values)
-    h = times.to(torch.float64).diff().to(values.dtype).unsqueeze(-1)
+    h = durations(times).to(values.dtype).unsqueeze(-1)
     pairs = []
     for x, factor in ((points, None), (velocities, h), (accelerations, h * h)):
         for side in (x[..., :-1, :], x[..., 1:, :]):
@@ -122,13 +126,61 @@ def _fields(
         return geodesics(group.name, start, steps.unflatten(-1, (5, group.tangent_size)), weights)
     algebra = group.arithmetic
     tangents = [split(x) for x in steps.split(group.tangent_size, dim=-1)]
+    by_row = [row.unbind(-1) for row in weights.unbind(-2)]
+    found = _logarithm(algebra, split(start), tangents, by_row, derivatives)
+    return tuple(join(field, rows) for field in found)
+
+
+def _product_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """The same on the components of one row, for `coordinates="product"`."""
+    start, tangents = _parts(group, row)
+    value, trace = forward(group, start, tangents, _quintics(u, derivatives), derivatives)
+    return [value, *trace[-1].rates]
+
+
+def _logarithm_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """Likewise for `coordinates="logarithm"`."""
+    start, tangents = _parts(group, row)
+    return _logarithm(group, start, tangents, _quintics(u, derivatives), derivatives)
+
+
+def _parts(group: GroupArithmetic, row: Vector) -> tuple[Vector, list[Vector]]:
+    size, tangent = group.point_size, group.tangent_size
+    return row[:size], [row[i : i + tangent] for i in range(size, len(row), tangent)]
+
+
+def _quintics(u: Scalar, derivatives: int) -> list[list[Scalar]]:
+    """a_1 ... a_5 and their derivatives at one u."""
+    rows: list[list[Scalar]] = []
+    for r in range(derivatives + 1):
+        row: list[Scalar] = []
+        for j in range(len(QUINTICS)):
+            value: Scalar = 0.0
+            for column in reversed(_COLUMNS[derivatives]):
+                value = plus(times(value, u), column[r][j])
+            row.append(value)
+        rows.append(row)
+    return rows
+
+
+def _logarithm(
+    group: GroupArithmetic,
+    start: Vector,
+    tangents: Sequence[Vector],
+    weights: Sequence[Sequence[Scalar]],
+    derivatives: int,
+) -> list[Vector]:
+    """`start Exp(phi)` and its rates, phi the sum of the tangents with these weights."""
     taylor = []
-    for r, row in enumerate(weights.unbind(-2)):
-        terms = (scale(a / factorial(r), p) for a, p in zip(row.unbind(-1), tangents, strict=True))
+    for r, row in enumerate(weights):
+        terms = (scale(a * (1.0 / factorial(r)), p) for a, p in zip(row, tangents, strict=True))
         taylor.append(add(*terms))
     x = tuple(map(jet.Jet, *taylor))
-    value = algebra.compose(split(start), algebra.exp(jet.values(x, 0)))
-    return tuple(join(field, rows) for field in (value, *jet.logarithmic_rates(algebra, x, derivatives)))
+    value = group.compose(start, group.exp(jet.values(x, 0)))
+    return [value, *jet.logarithmic_rates(group, x, derivatives)]
+
+
+_COMPONENTS = {"product": _product_components, "logarithm": _logarithm_components}
 
 
 def _from_world(
@@ -158,9 +210,9 @@ def hermite(
         values: `(*batch, M, P)` points of `group` at the knots, M >= 2; quaternions of any length and sign,
             neighbours are joined the short way round.
         velocities, accelerations: `(*batch, M, D)` at the knots, per second and per second squared.
-        t: `()`, `(N,)` or `(*batch, N)` seconds within the knots; float32 only while its rounding stays below a
-            thousandth of the shortest segment.
-        times: `(M,)` seconds of the knots, increasing, uniform or not.
+        t: `()`, `(N,)` or `(*batch, N)` within the knots: int64 nanoseconds if their times are, else seconds, float32
+            only while its rounding stays below a thousandth of the shortest segment.
+        times: `(M,)` seconds or int64 nanoseconds of the knots, increasing, uniform or not.
         coordinates: "product", the product of geodesics of [E17] (59), third order; "logarithm", one quintic in the
             logarithm, sixth order. See the module.
         frame: of velocities and accelerations at the knots, and of the product: "body" or, as in [E17], "world".
@@ -174,7 +226,7 @@ def hermite(
     """
     checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
     _check_knots(values, velocities, accelerations, times, group, coordinates, frame, validate)
-    check_query(t, derivatives, extrapolate, validate, values, values=values.shape[:-2])
+    check_query(t, times, derivatives, extrapolate, validate, values, values=values.shape[:-2])
     knots = (values, velocities, accelerations)
     state = _evaluate(knots, t, group, times, coordinates, frame, derivatives, extrapolate, validate)
     return to_body_frame(state, group) if frame == "world" else state
@@ -199,7 +251,9 @@ def _evaluate(
     def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
         return _fields(rows, u, group, coordinates, needed)
 
-    state = evaluate_segments(table, fields, group, t, times, derivatives, extrapolate, validate)
+    state = evaluate_segments(
+        table, fields, group, t, times, derivatives, extrapolate, validate, _COMPONENTS[coordinates]
+    )
     if frame == "body":
         return state
     value = group.inverse(state.value, validate=False)
@@ -257,7 +311,7 @@ class HermiteSpline(Trajectory):
             require grad and Parameters are used as given, others copied into Parameters, or buffers if not
             `learnable`.
         group, coordinates, frame, extrapolate, validate: as in `hermite`.
-        times: `(M,)` seconds, kept in float64; a tensor that requires grad is used as given.
+        times: `(M,)` seconds, kept in float64, or int64 nanoseconds; a tensor that requires grad is used as given.
         learnable: whether tensors that do not require grad become Parameters; never the times.
     """
 
@@ -293,8 +347,8 @@ class HermiteSpline(Trajectory):
         self._adopt_seconds("times", times)
 
     @property
-    def domain(self) -> tuple[float, float]:
-        """First and last knot, seconds."""
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last knot: seconds, or nanoseconds where their times are int64."""
         return self.times[0].item(), self.times[-1].item()
 
     def evaluate(self, t: Tensor, derivatives: int = 2, frame: Frame = "body") -> State:
@@ -302,7 +356,13 @@ class HermiteSpline(Trajectory):
         (`dX/dt X^-1` and its derivatives, as in [E17] (33), (36))."""
         checks.choice("frame", frame, ("body", "world"))
         check_query(
-            t, derivatives, self.extrapolate, self.validate, self.values, values=self.values.shape[:-2]
+            t,
+            self.times,
+            derivatives,
+            self.extrapolate,
+            self.validate,
+            self.values,
+            values=self.values.shape[:-2],
         )
         state = _evaluate(
             self._knots, t, self.group, self.times, self.coordinates, self.frame, derivatives, self.extrapolate,
@@ -321,14 +381,14 @@ class HermiteSpline(Trajectory):
         (95), (96), which say C for B. O(1) per query, no graph.
 
         Args:
-            t: `(N,)` or `(*batch, N)` seconds inside the domain.
+            t: `(N,)` or `(*batch, N)` inside the domain, in the unit of the knots.
             side: of perturbations of values, at the knots and of the result: `X <- Exp(delta) X` ("left") or
                 `X Exp(delta)`. Rates, of knots and results, are those in the spline's own `frame`.
         Raises:
             ValueError: a time outside the domain.
         """
         checks.choice("side", side, ("left", "right"))
-        check_query(t, 2, "error", True, self.values, values=self.values.shape[:-2])
+        check_query(t, self.times, 2, "error", True, self.values, values=self.values.shape[:-2])
         group, knots, times = self.group, self._knots, self.times.detach()
         knots = tuple(x.detach() for x in knots)  # type: ignore[assignment]
         if self.frame == "world":

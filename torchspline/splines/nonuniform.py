@@ -11,6 +11,9 @@ from torch import Tensor, nn
 
 from torchspline import checks
 from torchspline.arithmetic import jet
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.jet import Jet
+from torchspline.arithmetic.recurrence import forward
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, plus, times
 from torchspline.groups.components import join, split
@@ -25,11 +28,12 @@ from torchspline.splines.trajectory import State, Trajectory
 def local_knots(knots: Tensor, order: int) -> Tensor:
     """For each segment between neighbouring knots of the domain the 2 (k - 1) knots its basis functions need, as places
     u within the segment: `(S, 2 (k - 1))`, float64. Those of an empty segment are of no use."""
-    knots = knots.to(torch.float64)
+    if knots.dtype != torch.int64:
+        knots = knots.to(torch.float64)
     windows = knots.unfold(0, 2 * order - 2, 1)[1:-1] if order > 1 else knots[:, None]
     start, end = windows[:, order - 2 : order - 1], windows[:, order - 1 : order]
-    duration = end - start
-    return (windows - start) / torch.where(duration > 0, duration, 1.0)
+    duration = (end - start).to(torch.float64)
+    return (windows - start).to(torch.float64) / torch.where(duration > 0, duration, 1.0)
 
 
 def basis(local: Vector, u: Scalar) -> list[Scalar]:
@@ -94,6 +98,18 @@ def step_fields(group: Group, rows: Tensor, u: Tensor, derivatives: int, steps: 
     return geodesics(group.name, start, moves.unflatten(-1, (steps, group.tangent_size)), weights)
 
 
+def step_components(group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+    """The same on the components of one row."""
+    size, tangent = group.point_size, group.tangent_size
+    steps = (len(row) - size) // (tangent + 2)
+    moves = [row[size + j * tangent : size + (j + 1) * tangent] for j in range(steps)]
+    local = tuple(Jet(knot, *(0.0,) * derivatives) for knot in row[size + steps * tangent :])
+    sums = tuple(cumulative_basis(local, jet.variable(u, derivatives)))
+    weights = [jet.values(sums, r) for r in range(derivatives + 1)]
+    value, trace = forward(group, row[:size], moves, weights, derivatives)
+    return [value, *trace[-1].rates]
+
+
 def signs_continued(points: Tensor, group: Group) -> Tensor:
     """Unit, each quaternion on the side of its predecessor."""
     algebra = group.arithmetic
@@ -116,10 +132,11 @@ def nonuniform_bspline(
 
     Args:
         control_points: `(*batch, M, P)` points of `group`, M >= order, as in `bspline`.
-        t: `()`, `(N,)` or `(*batch, N)` seconds in `[knots[order - 1], knots[M]]`.
-        knots: `(M + order,)` seconds, not decreasing; inside the domain a knot that comes m times makes the curve
-            C^(order - 1 - m), one that comes order times breaks it. At the ends of the domain `order` equal knots make
-            the curve start or end at the end control point.
+        t: `()`, `(N,)` or `(*batch, N)` in `[knots[order - 1], knots[M]]`: seconds, or int64 nanoseconds if the knots
+            are.
+        knots: `(M + order,)` seconds or int64 nanoseconds, not decreasing; inside the domain a knot that comes m times
+            makes the curve C^(order - 1 - m), one that comes order times breaks it. At the ends of the domain `order`
+            equal knots make the curve start or end at the end control point.
         order: k >= 2.
         derivatives, extrapolate, validate: as in `bspline`.
     Returns:
@@ -134,7 +151,7 @@ def nonuniform_bspline(
     checks.points("control_points", control_points, group, least=order, look=validate)
     _check_knots(knots, control_points, order)
     check_query(
-        t, derivatives, extrapolate, validate, control_points, control_points=control_points.shape[:-2]
+        t, knots, derivatives, extrapolate, validate, control_points, control_points=control_points.shape[:-2]
     )
     table = step_table(signs_continued(control_points, group), local_knots(knots, order), group)
     domain = knots[order - 1 : control_points.shape[-2] + 1]
@@ -142,11 +159,13 @@ def nonuniform_bspline(
     def fields(rows: Tensor, u: Tensor, needed: int) -> tuple[Tensor, ...]:
         return step_fields(group, rows, u, needed, order - 1)
 
-    return evaluate_segments(table, fields, group, t, domain, derivatives, extrapolate, validate)
+    return evaluate_segments(
+        table, fields, group, t, domain, derivatives, extrapolate, validate, step_components
+    )
 
 
 def _check_knots(knots: Any, control_points: Tensor, order: int) -> None:
-    checks.is_floating_tensor("knots", knots)
+    checks.is_times("knots", knots)
     count = control_points.shape[-2]
     if knots.shape != (count + order,):
         raise ValueError(
@@ -186,7 +205,8 @@ class NonuniformBSpline(Trajectory):
         control_points: `(*batch, M, P)`; tensors that require grad and Parameters are used as given, others
             copied into a Parameter, or a buffer if not `learnable`.
         group, order, extrapolate, validate: as in `nonuniform_bspline`.
-        knots: `(M + order,)` seconds, kept in float64; a tensor that requires grad is used as given.
+        knots: `(M + order,)` seconds, kept in float64, or int64 nanoseconds; a tensor that requires grad is used as
+            given.
         learnable: whether control points that do not require grad become a Parameter; never the knots.
     """
 
@@ -217,8 +237,8 @@ class NonuniformBSpline(Trajectory):
         self._adopt_seconds("knots", knots)
 
     @property
-    def domain(self) -> tuple[float, float]:
-        """First and last time, seconds."""
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last time: seconds, or nanoseconds where the knots are int64."""
         return self.knots[self.order - 1].item(), self.knots[self.control_points.shape[-2]].item()
 
     def evaluate(self, t: Tensor, derivatives: int = 2) -> State:
@@ -228,20 +248,26 @@ class NonuniformBSpline(Trajectory):
             derivatives=derivatives, extrapolate=self.extrapolate, validate=self.validate,
         )  # fmt: skip
 
-    def insert_knot(self, time: float) -> "NonuniformBSpline":
+    def insert_knot(self, time: float | int) -> "NonuniformBSpline":
         """The spline with one more knot, and control point, at `time` inside the domain (Boehm's knot insertion).
 
         On a commutative group the curve stays as it is; on others it stays outside `order - 1` segments around, and
-        inside moves by as much as the factors do not commute.
+        inside moves by as much as the factors do not commute (`fit.approximate` fits it again there).
+
+        Args:
+            time: in the unit of the knots; a whole number where they are nanoseconds.
 
         Raises:
             ValueError: a time outside the domain, or one at which there are already `order - 1` knots.
         """
+        k, knots = self.order, self.knots.detach()
         checks.finite_number("time", time)
+        if knots.dtype == torch.int64 and not isinstance(time, int):
+            raise TypeError(f"time: expected a whole number of nanoseconds, as the knots are, got {time!r}")
         start, end = self.domain
         if not start <= time <= end:
-            raise ValueError(f"time: expected one inside the domain [{start}, {end}] s, got {time!r}")
-        k, knots = self.order, self.knots.detach()
+            unit = "ns" if knots.dtype == torch.int64 else "s"
+            raise ValueError(f"time: expected one inside the domain [{start}, {end}] {unit}, got {time!r}")
         there = int((knots == time).sum())
         if there >= k - 1:
             raise ValueError(
@@ -251,7 +277,7 @@ class NonuniformBSpline(Trajectory):
         points = signs_continued(self.control_points.detach(), self.group)
         # Point i moves towards its successor by the share of its support that lies before the new knot.
         i = torch.arange(m - k + 2, m - there + 1)
-        share = (time - knots[i]) / (knots[i + k - 1] - knots[i])
+        share = (time - knots[i]).to(torch.float64) / (knots[i + k - 1] - knots[i]).to(torch.float64)
         moved = self.group.interpolate(points[..., i - 1, :], points[..., i, :], share.to(points.dtype))
         new = torch.cat([points[..., : m - k + 2, :], moved, points[..., m - there :, :]], dim=-2)
         added = torch.cat([knots[: m + 1], knots.new_tensor([time]), knots[m + 1 :]])

@@ -11,11 +11,23 @@ from torchspline import checks
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import Group
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate
+from torchspline.splines.located import Components, located, rounding
 from torchspline.splines.trajectory import State
 
 #: From rows (*batch, n, C) of a table, u (n,) or (*batch, n) within [0, 1] and a number of derivatives to the value and
 #: so many rates by u, each (*batch, n, ...).
 Fields = Callable[[Tensor, Tensor, int], tuple[Tensor, ...]]
+
+
+#: Knots in whole nanoseconds (int64) are told apart and subtracted as integers, so that an epoch costs no digits.
+NANOSECOND = 1e-9
+
+
+def durations(times: Tensor) -> Tensor:
+    """Seconds between neighbouring `times`, float64; int64 times are nanoseconds."""
+    if times.dtype == torch.int64:
+        return times.diff().to(torch.float64) * NANOSECOND
+    return times.to(torch.float64).diff()
 
 
 class Place(NamedTuple):
@@ -30,8 +42,8 @@ class Place(NamedTuple):
 
 
 def check_knot_times(times: Any, count: int, what: str = "knots") -> None:
-    """Times of `count` knots, `(count,)` seconds: an error unless they are finite and increasing."""
-    checks.is_floating_tensor("times", times)
+    """Times of `count` knots, `(count,)` seconds or int64 nanoseconds: an error unless finite and increasing."""
+    checks.is_times("times", times)
     if times.shape != (count,):
         raise ValueError(
             f"times: expected shape ({count},), one time for each of the {what}, got {tuple(times.shape)}"
@@ -47,15 +59,28 @@ def check_knot_times(times: Any, count: int, what: str = "knots") -> None:
 
 
 def check_query(
-    t: Any, derivatives: int, extrapolate: str, validate: bool, like: Tensor, **batch: torch.Size
+    t: Any,
+    times: Tensor,
+    derivatives: int,
+    extrapolate: str,
+    validate: bool,
+    like: Tensor,
+    **batch: torch.Size,
 ) -> None:
-    """The arguments of an evaluation that do not concern the curve itself."""
+    """The arguments of an evaluation that do not concern the curve itself; `times` of its knots, for their unit."""
     if type(derivatives) is not int or not 0 <= derivatives <= MAX_DERIVATIVES:
         raise ValueError(
             f"derivatives: expected a whole number from 0 to {MAX_DERIVATIVES}, got {derivatives!r}"
         )
     checks.choice("extrapolate", extrapolate, EXTRAPOLATE)
-    checks.is_floating_tensor("t", t)
+    if isinstance(t, Tensor) and (t.dtype == torch.int64) != (times.dtype == torch.int64):
+        expected = (
+            "int64 nanoseconds, as the knots are"
+            if times.dtype == torch.int64
+            else "torch.float32 or torch.float64 seconds, as the knots are (nanoseconds go with int64 knots)"
+        )
+        raise TypeError(f"t: expected {expected}, got {t.dtype}")
+    checks.is_times("t", t)
     if t.device != like.device:
         (name,) = batch
         raise ValueError(
@@ -74,20 +99,23 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     A knot belongs to the segment that it starts; the last one to the last segment. Where values cannot be seen (other
     devices, `vmap`, compilation) times outside give NaN instead of an error.
     """
-    knots, s = times.to(torch.float64).contiguous(), t.to(torch.float64)
+    nanoseconds = times.dtype == torch.int64
+    knots, s = (times, t) if nanoseconds else (times.to(torch.float64), t.to(torch.float64))
+    knots = knots.contiguous()
     steps = knots.diff()
-    if validate:
+    if validate and not nanoseconds:
         _check_rounding(t, steps)
     # The last segment of some duration: knots may come more than once.
     last = (knots.detach() < knots.detach()[-1]).sum() - 1
     segment = torch.searchsorted(knots.detach(), s.detach().contiguous(), right=True) - 1
     segment = torch.minimum(segment.clamp_min(0), last)
-    duration = steps[segment]
-    u = (s - knots[segment]) / duration
+    duration = steps[segment].to(torch.float64)
+    u = (s - knots[segment]).to(torch.float64) / duration
+    if nanoseconds:
+        duration = duration * NANOSECOND
     # A few rounding errors beyond the ends belong to the domain.
-    rounding = 8.0 * torch.finfo(torch.float32 if t.dtype == torch.float32 else torch.float64).eps
     ends = knots.detach()
-    slack = rounding * (ends.abs().amax() + ends[-1] - ends[0])
+    slack = 0 if nanoseconds else rounding(t.dtype) * (ends.abs().amax() + ends[-1] - ends[0])
     outside = ~((s.detach() >= ends[0] - slack) & (s.detach() <= ends[-1] + slack))
     if extrapolate != "error":
         inside = torch.where(outside, u.clamp(0.0, 1.0), u)
@@ -117,9 +145,10 @@ def _refuse(outside: Tensor, t: Tensor, knots: Tensor) -> bool:
         return seen is not None
     first = t.detach()[outside].flatten()[0].item()
     start, stop = knots.detach()[0].item(), knots.detach()[-1].item()
+    unit = "ns" if t.dtype == torch.int64 else "s"
     raise ValueError(
-        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] s, the first is "
-        f"{first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
+        f"t: {int(outside.sum())} of {outside.numel()} times lie outside the domain [{start}, {stop}] {unit}, "
+        f"the first is {first!r}; choose times inside, or extrapolate='clamp' or 'linear'"
     )
 
 
@@ -151,13 +180,19 @@ def evaluate_segments(
     derivatives: int,
     extrapolate: Extrapolate,
     validate: bool,
+    components: Components | None = None,
 ) -> State:
     """Value and rates per second of a curve made of segments.
 
     Args:
         table: (*batch, M - 1, C), what determines each segment. fields: the curve from that.
-        times: (M,), of the M - 1 segments.
+        times: (M,) seconds or int64 nanoseconds, as `t`, of the M - 1 segments.
+        components: the same as `fields` on components, for loops that may be compiled.
     """
+    if components is not None:
+        found = located(components, group, table, t, times, derivatives)
+        if found is not None:
+            return State(*found)
     dtype = table.dtype
     aligned, common, shape = align(t, table.shape[:-2])
     place = locate_between(aligned, times, extrapolate, validate)

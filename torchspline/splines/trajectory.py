@@ -108,7 +108,8 @@ class Trajectory(nn.Module, ABC):
 
     #: The group its values live in.
     group: Group
-    #: Names of what it keeps in seconds: tensors, Parameters or None, float64 whatever the module is converted to.
+    #: Names of what it keeps in seconds: tensors, Parameters or None, float64 whatever the module is converted to; or
+    #: in whole nanoseconds, int64.
     _times: tuple[str, ...] = ()
 
     @property
@@ -137,8 +138,9 @@ class Trajectory(nn.Module, ABC):
         self._keep(name, x)
 
     def _adopt_seconds(self, name: str, x: Tensor) -> None:
-        """Keep times as given if they carry a graph or are a `Parameter`, else a copy in float64 that is not learnt."""
-        if not isinstance(x, nn.Parameter) and not x.requires_grad:
+        """Keep times as given if they carry a graph or are a `Parameter`, else a copy in float64 that is not learnt;
+        int64 nanoseconds stay what they are."""
+        if x.dtype != torch.int64 and not isinstance(x, nn.Parameter) and not x.requires_grad:
             x = x.to(torch.float64)
         self._adopt(name, x, learnable=False)
 
@@ -160,6 +162,18 @@ class Trajectory(nn.Module, ABC):
             else:
                 setattr(self, name, before.to(new.device))
         return self
+
+    def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
+        """Seconds stay seconds and nanoseconds nanoseconds: the numbers of a state say which, not the module's."""
+        for name in self._times:
+            own, new = getattr(self, name), state.get(prefix + name)
+            if (
+                own is not None
+                and isinstance(new, Tensor)
+                and (own.dtype == torch.int64) != (new.dtype == torch.int64)
+            ):
+                self._keep(name, torch.empty_like(own.detach(), dtype=new.dtype))
+        super()._load_from_state_dict(state, prefix, *rest)
 
     def forward(self, t: Tensor) -> Tensor:
         """Values at the times `t`, `(*batch, N, P)`."""

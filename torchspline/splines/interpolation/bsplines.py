@@ -6,10 +6,11 @@ from torch import Tensor
 
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.jet import Jet
+from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, add, scale
 from torchspline.groups.group import Group
 from torchspline.splines.interpolation.scheme import CurveScheme, Properties, Scheme
-from torchspline.splines.nonuniform import basis, local_knots, step_fields, step_table
+from torchspline.splines.nonuniform import basis, local_knots, step_components, step_fields, step_table
 
 _ORDER = 4
 
@@ -25,18 +26,16 @@ def with_phantoms(group: Group, keys: Tensor) -> Tensor:
 
 def knots_of(times: Tensor) -> Tensor:
     """Key times, and as many mirrored in the ends as a cubic needs: symmetric there like the points."""
-    times = times.to(torch.float64)
-    front = [2.0 * times[0] - times[i] for i in (3, 2, 1)] if len(times) > 3 else _even(times, front=True)
-    back = (
-        [2.0 * times[-1] - times[-1 - i] for i in (1, 2, 3)] if len(times) > 3 else _even(times, front=False)
-    )
+    times = times if times.dtype == torch.int64 else times.to(torch.float64)
+    front = [2 * times[0] - times[i] for i in (3, 2, 1)] if len(times) > 3 else _even(times, front=True)
+    back = [2 * times[-1] - times[-1 - i] for i in (1, 2, 3)] if len(times) > 3 else _even(times, front=False)
     return torch.cat([torch.stack(front), times, torch.stack(back)])
 
 
 def _even(times: Tensor, front: bool) -> list[Tensor]:
     """Too few keys to mirror three: those there are, then evenly on."""
     end, step = (times[0], times[0] - times[1]) if front else (times[-1], times[-1] - times[-2])
-    made = [2.0 * end - x for x in (times[1:] if front else times[:-1].flip(0))]
+    made = [2 * end - x for x in (times[1:] if front else times[:-1].flip(0))]
     while len(made) < 3:
         made.append(made[-1] + step)
     return made[::-1] if front else made
@@ -52,6 +51,9 @@ class CumulativeBSpline(Scheme):
 
     def fields(self, group: Group, rows: Tensor, u: Tensor, derivatives: int) -> tuple[Tensor, ...]:
         return step_fields(group, rows, u, derivatives, _ORDER - 1)
+
+    def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+        return step_components(group, row, u, derivatives)
 
 
 class BlendedBSpline(CurveScheme):

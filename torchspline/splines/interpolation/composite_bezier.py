@@ -12,6 +12,7 @@ from torchspline.arithmetic.vector import Vector, add, scale
 from torchspline.groups.group import Group
 from torchspline.splines.interpolation.bezier import bernstein
 from torchspline.splines.interpolation.scheme import CurveScheme, Properties
+from torchspline.splines.segments import durations
 
 
 class CompositeBezier(CurveScheme):
@@ -27,7 +28,7 @@ class CompositeBezier(CurveScheme):
     options = MappingProxyType({"ends": ("natural", "clamped", "periodic")})
 
     def table(self, group: Group, keys: Tensor, times: Tensor, **options: str) -> Tensor:
-        h = times.to(torch.float64).diff().to(keys.dtype)
+        h = durations(times).to(keys.dtype)
         third = (h / 3.0).unsqueeze(-1)
         rates = rates_at_keys(group, keys, h, options["ends"])
         start, end = keys[..., :-1, :], keys[..., 1:, :]

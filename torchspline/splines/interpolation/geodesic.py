@@ -3,6 +3,10 @@
 import torch
 from torch import Tensor
 
+from torchspline.arithmetic.group import GroupArithmetic
+from torchspline.arithmetic.recurrence import forward
+from torchspline.arithmetic.scalar import Scalar
+from torchspline.arithmetic.vector import Vector
 from torchspline.groups.components import join, split
 from torchspline.groups.group import Group
 from torchspline.groups.operations import geodesics
@@ -29,3 +33,9 @@ class Geodesic(Scheme):
         rates = u.new_tensor([1.0, 0.0, 0.0][:derivatives]).expand(*u.shape, derivatives)
         weights = torch.cat([u.unsqueeze(-1), rates], dim=-1)
         return geodesics(group.name, start, step.unsqueeze(-2), weights.unsqueeze(-1))
+
+    def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+        start, step = row[: group.point_size], row[group.point_size :]
+        weights: list[list[Scalar]] = [[u], [1.0], [0.0], [0.0]]
+        value, trace = forward(group, start, [step], weights[: derivatives + 1], derivatives)
+        return [value, *trace[-1].rates]

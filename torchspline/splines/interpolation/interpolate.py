@@ -45,8 +45,8 @@ def interpolate(
 
             `KeyframeSpline.properties` says what a scheme promises.
         keyframes: `(*batch, M, P)` points of the group, quaternions of any length.
-        times: `(M,)` seconds of the keys, increasing, uniform or not.
-        t: `()`, `(N,)` or `(*batch, N)` seconds from the first to the last key.
+        times: `(M,)` seconds or int64 nanoseconds of the keys, increasing, uniform or not.
+        t: `()`, `(N,)` or `(*batch, N)` from the first to the last key, in the unit of `times`.
         derivatives: how many, 0 to 3.
         group: goes with a plain name.
         way: "short": rotations between neighbouring keys go the short way round, at exactly pi so that the first
@@ -64,11 +64,13 @@ def interpolate(
     """
     scheme, of, options = _resolve(method, keyframes, group, options)
     _check_keys(scheme, keyframes, times, of, way, validate)
-    check_query(t, derivatives, extrapolate, validate, keyframes, keyframes=keyframes.shape[:-2])
+    check_query(t, times, derivatives, extrapolate, validate, keyframes, keyframes=keyframes.shape[:-2])
     keys = signs_continued(keyframes, of) if way == "short" else _unit(keyframes, of)
     table = scheme.table(of, keys, times, **options)
     ends, fields = scheme.segments(times), partial(scheme.fields, of)
-    return evaluate_segments(table, fields, of, t, ends, derivatives, extrapolate, validate)
+    return evaluate_segments(
+        table, fields, of, t, ends, derivatives, extrapolate, validate, scheme.components
+    )
 
 
 def _unit(keyframes: Tensor, group: Group) -> Tensor:
@@ -134,7 +136,7 @@ class KeyframeSpline(Trajectory):
         method, group, way, extrapolate, validate, options: as in `interpolate`.
         keyframes: `(*batch, M, P)`; tensors that require grad and Parameters are used as given, others copied into a
             Parameter, or a buffer if not `learnable`.
-        times: `(M,)` seconds, kept in float64; a tensor that requires grad is used as given.
+        times: `(M,)` seconds, kept in float64, or int64 nanoseconds; a tensor that requires grad is used as given.
         learnable: whether keyframes that do not require grad become a Parameter; never the times.
     """
 
@@ -165,8 +167,8 @@ class KeyframeSpline(Trajectory):
         self._adopt_seconds("times", times)
 
     @property
-    def domain(self) -> tuple[float, float]:
-        """First and last key, seconds."""
+    def domain(self) -> tuple[float, float] | tuple[int, int]:
+        """First and last key: seconds, or nanoseconds where their times are int64."""
         return self.times[0].item(), self.times[-1].item()
 
     def evaluate(self, t: Tensor, derivatives: int = 2) -> State:

@@ -23,9 +23,7 @@ from torchspline.groups.operations import FUSED_ROWS
 from torchspline.kernels.mode import flat, usable
 from torchspline.kernels.rowwise import RowKernel
 from torchspline.kernels.trace import trace
-
-#: Most operations of a curve that is compiled.
-LONGEST = 2000
+from torchspline.splines.located import LONGEST
 
 
 @dataclass(frozen=True)
@@ -63,6 +61,10 @@ class Scheme(ABC):
     @abstractmethod
     def fields(self, group: Group, rows: Tensor, u: Tensor, derivatives: int) -> tuple[Tensor, ...]:
         """Value and rates by u, in [0, 1], from rows (*batch, n, C) of the table and u (n,) or (*batch, n)."""
+
+    @abstractmethod
+    def components(self, group: GroupArithmetic, row: Vector, u: Scalar, derivatives: int) -> list[Vector]:
+        """The same on components."""
 
 
 class CurveScheme(Scheme):

@@ -10,6 +10,7 @@ from torchspline.arithmetic.vector import Vector, scale
 from torchspline.groups.group import Group
 from torchspline.splines.interpolation.geodesic import steps_between
 from torchspline.splines.interpolation.scheme import CurveScheme, Properties
+from torchspline.splines.segments import durations
 
 
 class Squad(CurveScheme):
@@ -23,7 +24,7 @@ class Squad(CurveScheme):
     least = 3
 
     def table(self, group: Group, keys: Tensor, times: Tensor, **options: str) -> Tensor:
-        h = times.to(torch.float64).diff().to(keys.dtype).unsqueeze(-1)
+        h = durations(times).to(keys.dtype).unsqueeze(-1)
         steps = steps_between(group, keys)
         backward, forward = (
             steps[..., :-1, :],
