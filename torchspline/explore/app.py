@@ -200,7 +200,8 @@ class App:
         self._drawn.append(
             scene.add_line_segments(f"/curves/{i}/path", ends, rgb, thickness=3.0, thickness_units="screen")
         )
-        self._drawn.append(scene.add_label(f"/curves/{i}/name", curve.method, position=path[-1]))
+        if self.apart.value:  # else names would stand on each other
+            self._drawn.append(scene.add_label(f"/curves/{i}/name", curve.method, position=path[-1]))
         if curve.rotation is None:
             return
         turns = numbers(curve.rotation)
