@@ -48,7 +48,9 @@ class Browser:
         self._session: str | None = None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        self.call("Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False
+        )
 
     def __enter__(self) -> "Browser":
         return self
@@ -117,7 +119,9 @@ class Browser:
 
     def wheel(self, place: tuple[float, float], amount: float) -> None:
         """Turn the wheel at a place."""
-        self.call("Input.dispatchMouseEvent", type="mouseWheel", x=place[0], y=place[1], deltaX=0, deltaY=amount)
+        self.call(
+            "Input.dispatchMouseEvent", type="mouseWheel", x=place[0], y=place[1], deltaX=0, deltaY=amount
+        )
 
     def picture(self, path: Path) -> None:
         """A PNG of what is to be seen."""

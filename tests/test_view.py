@@ -42,7 +42,9 @@ def test_data_are_those_of_the_trajectory():
 
 
 def test_nanoseconds_count_from_the_start():
-    spline = SplitBSpline(POINTS, order=4, dt_ns=500_000_000, t0_ns=1_700_000_000_000_000_000, learnable=False)
+    spline = SplitBSpline(
+        POINTS, order=4, dt_ns=500_000_000, t0_ns=1_700_000_000_000_000_000, learnable=False
+    )
     (curve,) = data_of(page(spline, samples=7))["curves"]
     assert curve["t"] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
 
@@ -113,7 +115,9 @@ def test_in_a_browser(tmp_path):
         browser.wheel((500, 300), -500)
         browser.wait(f"camera.distance < 0.6 * {distance}")
 
-        seek = "const s = document.getElementById('slider'); s.value = 0.5; s.dispatchEvent(new Event('input'))"
+        seek = (
+            "const s = document.getElementById('slider'); s.value = 0.5; s.dispatchEvent(new Event('input'))"
+        )
         browser.value(f"(() => {{ {seek} }})()")
         browser.wait("document.getElementById('clock').textContent === '1.500 s'")
         browser.value("document.querySelectorAll('#legend input')[1].click()")
