@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_generate
 import error_imu
 import error_imu_allan
 import error_imu_earth
@@ -33,6 +34,7 @@ FILES = (
     error_imu_earth,
     error_imu_allan,
     error_imu,
+    error_generate,
     error_robot,
     error_splines,
 )
@@ -86,7 +88,15 @@ def public() -> dict[str, Callable[..., Any]]:
         elif callable(x) and not isinstance(x, torchspline.Group):
             found[x.__name__] = x
 
-    for root in (torchspline, records, Mounted, SlidingWindow, BatchProblem, *error_robot.ROOTS):
+    for root in (
+        torchspline,
+        records,
+        Mounted,
+        SlidingWindow,
+        BatchProblem,
+        *error_generate.ROOTS,
+        *error_robot.ROOTS,
+    ):
         visit(root)
     return found
 
@@ -107,6 +117,7 @@ RESULTS = {
     "Differentials",
     "Readings",
     "AmbientReadings",
+    *error_generate.RESULTS,
     *error_robot.RESULTS,
     *error_splines.RESULTS,
 }
@@ -115,6 +126,7 @@ RESULTS = {
 UNTRIED = {
     "PoseFit.rms": "no arguments",
     "LowPass.extra_repr": "no arguments; PyTorch calls it",
+    **error_generate.UNTRIED,
     **error_robot.UNTRIED,
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",

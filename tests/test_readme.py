@@ -10,7 +10,7 @@ README = Path(__file__).resolve().parent.parent / "README.md"
 
 def test_readme_code_runs() -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     torch.manual_seed(0)
     names: dict = {}
     for code in blocks:  # each goes on where the one before ended
@@ -18,6 +18,7 @@ def test_readme_code_runs() -> None:
     assert names["gyroscope"].shape == (100, 3)
     assert torch.isfinite(names["loss"])
     assert names["result"].converged
+    assert names["batch"]["gyroscope"].shape == (8, 400, 3)
     assert names["corrected"].gyroscope.shape == (100, 3)
 
 

@@ -26,6 +26,9 @@ COMMANDS: dict[str, Command] = {
     "fit": Command(f"{_HERE}.fit", "fit", "a spline through a file of poses"),
     "imu": Command(f"{_HERE}.imu", "imu", "IMU readings from a file of poses, compared with a recording"),
     "body": Command(f"{_HERE}.body", "body", "IMU readings on every joint of a captured motion (BVH)"),
+    "generate": Command(
+        f"{_HERE}.generate", "generate", "random motions and IMUs on them, as data to train on"
+    ),
     "bench": Command(f"{_HERE}.bench", "bench", "how long the main calls take on this machine"),
     "view": Command(f"{_HERE}.view", "view", "a page with an interactive 3D view of a file"),
     "explore": Command(f"{_HERE}.explore", "explore", "compare interpolation methods in the browser"),

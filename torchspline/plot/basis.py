@@ -104,6 +104,8 @@ def basis(
     axes.grid(alpha=0.3)
     axes.margins(x=0.01)
     if len(times) <= 12:
-        axes.legend(fontsize=7, ncols=7, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
+        axes.legend(
+            fontsize=7, ncols=len(times) + 1, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False
+        )
     axes.set_title(title or (f"uniform B-spline of order {method}" if isinstance(method, int) else method))
     return figure

@@ -72,10 +72,11 @@ def trajectory(
     for motion in drawn.values():
         if motion.kinematics.position is not None and motion.kinematics.rotation is not None and frames:
             _draw_frames(axes, motion, frames, length)
-    if all(motion.kinematics.position is None for motion in drawn.values()):
+    turning = [motion.kinematics.position is None for motion in drawn.values()]
+    if all(turning):
         for axis in AXES:
             getattr(axes, f"set_{axis}label")(axis)
-    if any(drawn):
+    if any(drawn) or any(turning):
         axes.legend(fontsize=8)
     axes.set_title(title)
     return figure
@@ -115,7 +116,10 @@ def rates(
         axes.margins(x=0.01)
     panels[-1].set_xlabel(next(iter(drawn.values())).label)
     if any(drawn):
-        panels[0].legend(fontsize=8)
+        lines = {
+            line.get_label(): line for axes in panels for line in axes.lines
+        }  # some have no line in the first
+        panels[0].legend(lines.values(), lines.keys(), fontsize=8)
     panels[0].set_title(title)
     return figure
 
@@ -190,8 +194,10 @@ def _ellipses(path: Array, covariance: Array) -> Array:
     tangent = np.gradient(path, axis=0)
     length = np.linalg.norm(tangent, axis=-1, keepdims=True)
     tangent = np.where(length > 0, tangent / np.where(length > 0, length, 1.0), [1.0, 0.0, 0.0])
-    # Any direction that is not along the path; one choice for all points would fail where the path follows it.
-    aside = np.eye(3)[np.abs(tangent).argmin(axis=-1)]
+    # One direction for all points, or the surface would be twisted where it changes: that of many, spread over the
+    # sphere, that the path keeps off most.
+    directions = _spread(200)
+    aside = directions[np.abs(directions @ tangent.T).max(axis=1).argmin()]
     first = np.cross(tangent, aside)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     second = np.cross(tangent, first)
@@ -202,6 +208,14 @@ def _ellipses(path: Array, covariance: Array) -> Array:
     angle = np.linspace(0.0, 2 * np.pi, _AROUND)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return (plane @ root @ circle).swapaxes(-1, -2)
+
+
+def _spread(count: int) -> Array:
+    """Directions evenly over the sphere, on a spiral of golden angles: (count, 3)."""
+    i = np.arange(count) + 0.5
+    z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
 
 
 def _draw_frames(axes: Any, motion: Motion, frames: int, length: float) -> None:

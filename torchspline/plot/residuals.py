@@ -67,7 +67,7 @@ def residuals(
             )
             good = column[np.isfinite(column)]
             if len(good) and np.ptp(good) > 0:
-                counts, edges = np.histogram(good, bins=60, density=True)
+                counts, edges = np.histogram(good, bins=int(np.clip(len(good) ** 0.5, 10, 80)), density=True)
                 spread.stairs(counts, edges, orientation="horizontal", color=color)
                 grid = np.linspace(edges[0], edges[-1], 200)
                 normal = np.exp(-0.5 * ((grid - good.mean()) / good.std()) ** 2) / good.std()
