@@ -62,8 +62,9 @@ def parse(
         chosen = parser.parse_args(_spelled_out(words, switches, {*parameters, "config"}))
     except ArgumentError as error:
         raise Mistake(" ".join(str(error).split())) from None
-    chosen = parser.instantiate_classes(chosen)
-    values = {name: getattr(chosen, name) for name in parameters}
+    # The second name is that of versions before 4.49.
+    chosen = (parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes)(chosen)
+    values = {name: chosen[name] for name in parameters}  # attributes such as items are taken
     return partial(function, **values), not own_json and chosen.json
 
 
