@@ -5,8 +5,8 @@ accelerometer of a real recording. With the biases and scales that it finds, rea
 model and the gyroscope is integrated; poses serve to measure errors, of 1 s, 5 s and 10 s and of the whole run from its
 first pose on, and for nothing else. Compared with: no correction; the mean of the stillest second among the first 20 as
 bias (the usual practice, which needs a rest); the same least squares without a network and training; and the constant
-bias that the poses themselves tell, about the most that can be had. Poses of EuRoC come from a fusion that used the same
-IMU, those of TUM VI from motion capture. No parameter was trained on these recordings, but
+bias that the poses themselves tell, about the most that can be had. Poses of EuRoC come from a fusion that used the
+same IMU, those of TUM VI from motion capture. No parameter was trained on these recordings, but
 they were looked at while motions, sensors and the network were chosen.
 """
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
+import error_calibration_files
 import error_generate
 import error_imu
 import error_imu_allan
@@ -37,6 +38,7 @@ FILES = (
     error_generate,
     error_robot,
     error_splines,
+    error_calibration_files,
 )
 CASES = [case for file in FILES for case in file.CASES]
 
@@ -96,6 +98,7 @@ def public() -> dict[str, Callable[..., Any]]:
         BatchProblem,
         *error_generate.ROOTS,
         *error_robot.ROOTS,
+        *error_calibration_files.ROOTS,
     ):
         visit(root)
     return found

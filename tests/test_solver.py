@@ -51,6 +51,12 @@ class Inverse(Factor):
     def inverse(self, i, j):
         return np.full(i.shape, 1 / self.number)
 
+    def diagonal(self):
+        return np.array([1 / self.number])
+
+    def trace(self, other):
+        return float(other.diagonal()[0]) / self.number
+
 
 class Scalar(System):
     """r(x) with derivative d(x)."""

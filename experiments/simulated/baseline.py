@@ -58,7 +58,7 @@ def _residual_of(group: Group, order: int, kind: str, spacing: float) -> Callabl
     def residual(step: Tensor, window: Tensor, u: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         tangents = step.reshape(order, -1)
         moved = group.retract(window, tangents, side="right", validate=False)
-        X, first, second = _product_rule(group, moved, u, order, kind)
+        X, first, second = product_rule(group, moved, u, order, kind)
         if kind == "value":
             point = group.compose(
                 _point(group, moved, u, order), group.inverse(measured, validate=False), validate=False
@@ -68,7 +68,7 @@ def _residual_of(group: Group, order: int, kind: str, spacing: float) -> Callabl
             inverse = torch.linalg.inv(X)
             velocity = inverse @ first
             rate = velocity if kind == "vel" else inverse @ second - velocity @ velocity
-            error = _vee(group, rate) / spacing ** (1 if kind == "vel" else 2) - measured
+            error = vee(group, rate) / spacing ** (1 if kind == "vel" else 2) - measured
         return error, error
 
     return residual
@@ -85,7 +85,7 @@ def _point(group: Group, points: Tensor, u: Tensor, order: int) -> Tensor:
     return value
 
 
-def _product_rule(
+def product_rule(
     group: Group, points: Tensor, u: Tensor, order: int, kind: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """X and its first two derivatives by u, as matrices."""
@@ -135,6 +135,6 @@ def _hat(group: Group, d: Tensor) -> Tensor:
     return torch.cat([upper, torch.zeros_like(upper[:1])], dim=0)
 
 
-def _vee(group: Group, matrix: Tensor) -> Tensor:
+def vee(group: Group, matrix: Tensor) -> Tensor:
     w = torch.stack([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
     return w if group.tangent_size == 3 else torch.cat([matrix[:3, 3], w])

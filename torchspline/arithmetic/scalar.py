@@ -1,6 +1,6 @@
 """The few scalar operations the arithmetic needs beyond `+ - * /`, for every kind of number it runs on.
 
-Components are torch tensors, Python floats, or anything registered with `namespace` (symbols that record
+Components are torch tensors, NumPy arrays, Python floats, or anything registered with `namespace` (symbols that record
 what is done to them, multi-precision numbers in the tests).
 """
 
@@ -9,6 +9,7 @@ from functools import singledispatch
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch
 
 # A component: a tensor, a float, a symbol. The arithmetic never asks which.
@@ -28,6 +29,7 @@ _FLOAT = SimpleNamespace(
     where=lambda condition, yes, no: yes if condition else no,
 )
 namespace.register(torch.Tensor, lambda x: torch)
+namespace.register(np.ndarray, lambda x: np)
 namespace.register(float, lambda x: _FLOAT)
 namespace.register(int, lambda x: _FLOAT)
 

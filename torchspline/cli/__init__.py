@@ -29,6 +29,9 @@ COMMANDS: dict[str, Command] = {
     "generate": Command(
         f"{_HERE}.generate", "generate", "random motions and IMUs on them, as data to train on"
     ),
+    "calibrate camera-imu": Command(
+        f"{_HERE}.calibrate", "camera_imu", "where cameras sit on an IMU, from images of a board"
+    ),
     "bench": Command(f"{_HERE}.bench", "bench", "how long the main calls take on this machine"),
     "view": Command(f"{_HERE}.view", "view", "a page with an interactive 3D view of a file"),
     "explore": Command(f"{_HERE}.explore", "explore", "compare interpolation methods in the browser"),

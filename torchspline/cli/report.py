@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ class Report:
     title: str
     #: What scripts read: names with units, plain values.
     values: dict[str, Any]
-    #: Rows of the table: what, value, unit.
-    rows: list[tuple[str, str, str]] = field(default_factory=list)
+    #: Rows of the table: what, value, unit, unless `columns` says otherwise.
+    rows: Sequence[tuple[str, ...]] = ()
     #: Things a careful user wants to know, in words.
     notes: list[str] = field(default_factory=list)
     #: What was written.
@@ -24,19 +25,21 @@ class Report:
     passed: bool = True
     #: Printed as it is, before all else; scripts find it in the values.
     text: str = ""
+    columns: tuple[str, ...] = ("", "value", "unit")
 
     def print(self) -> None:
         """On standard output."""
         from rich.console import Console
         from rich.table import Table
+        from rich.text import Text
 
         if self.text:
             print(self.text)
         console = Console()
         if self.rows:
-            table = Table("", "value", "unit", title=self.title)
+            table = Table(*self.columns, title=self.title)
             for row in self.rows:
-                table.add_row(*row)
+                table.add_row(*map(Text, row))  # units in brackets are no markup
             console.print(table)
         for note in self.notes:
             console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchspline.fit.kernel import ResidualKernel
 from torchspline.fit.model import Model, State, seconds_of
 from torchspline.fit.residual import square_root_information
 from torchspline.fit.system import Factor, SingularError, System
@@ -36,6 +37,12 @@ def differentiable(linearizer: "Linearizer", state: State, system: System) -> Nu
     Raises:
         ValueError: nothing requires grad; the solution is not determined.
     """
+    for term in _terms(linearizer):
+        if not isinstance(term.kernel, ResidualKernel):
+            raise ValueError(
+                f"differentiable: {term.residual.name} sums up its measurements and has no automatic derivatives; "
+                "use the residual of a single measurement, such as ReprojectionRadtan"
+            )
     tensors = _inputs(linearizer)
     if not tensors:
         raise ValueError(
@@ -221,6 +228,7 @@ def _of_term(term: Term, numbers: Numbers, given: Numbers) -> Tensor:
                 back[term.order] = np.arange(len(back))
                 own = own[torch.from_numpy(term.index[slot][back])]
         vectors.append(own)
+    assert isinstance(term.kernel, ResidualKernel)
     error = term.kernel.on_tensors(*vectors)
     kind, weights = residual.weighting
     root = square_root_information((kind, None if weights is None else of(weights)))

@@ -244,7 +244,8 @@ class Problem:
         splines = [Spline(x, origin) for x in self._unknowns if isinstance(x, BSpline)]
         variables = [x for x in self._unknowns if isinstance(x, Variable)]
         model = Model(splines, variables, {id(x): kept for x, kept in self._frozen.items()})
-        terms = [Term(r, model, origin, i) for r, i in zip(self.residuals, self._indices, strict=True)]
+        pairs = zip(self.residuals, self._indices, strict=True)
+        terms = [(r.term or Term)(r, model, origin, i) for r, i in pairs]
         return Linearizer(model, [*terms, *(prior.bind(model) for prior in self.priors)])
 
 
@@ -261,6 +262,12 @@ class Linearizer:
         system = self._empty(state)
         for term in self.terms:
             term.add_to(system, state)
+        return system
+
+    def system_of(self, term: Term | Bends | BoundPrior, state: State) -> System:
+        """What one of the terms has in the normal equations."""
+        system = self._empty(state)
+        term.add_to(system, state)
         return system
 
     def _empty(self, state: State) -> System:

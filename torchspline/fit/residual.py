@@ -65,8 +65,9 @@ class Clock:
         offset, skew: unknowns of one number each, s and s/s.
         mid: time of the trajectory at which the skew turns, in the unit of its times; by default the middle of its
             domain.
-        delay: an unknown of one number, s: the line delay of a rolling shutter. late: by how many delays each
-            measurement is later, (N,), such as the line it was seen on.
+        delay: an unknown of one number, s, such as the line delay of a rolling shutter. late: by how many delays the
+            stamp of each measurement comes late, (N,): minus the line it was seen on, if images bear the stamp of their
+            first line, since later lines are exposed after it.
     Raises:
         TypeError, ValueError: a wrong type or shape, or one of `delay` and `late` without the other.
     """
@@ -131,6 +132,8 @@ class Residual(ABC):
     slots: ClassVar[Mapping[str, Slot]] = {}
     #: Whether its loops are compiled; with very many operations tensors are quicker than waiting for that.
     compiled: ClassVar[bool] = True
+    #: The `Term` that binds it to a problem, where that is not the common one.
+    term: ClassVar[Any] = None
 
     def __init__(
         self,

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit.model import State, Unknown
+from torchspline.fit.scatter import scatter
 from torchspline.fit.solver import Trace
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
@@ -60,6 +61,7 @@ class Result:
         if numbers is None:
             points = {key: torch.from_numpy(x).clone() for key, x in state.points.items()}
             numbers = points | {key: x.clone() for key, x in state.values.items()}
+        self._scatter: dict[float, Array] = {}
         #: The trajectory's control points, unit, and the variables' values by name; with a graph if so asked.
         self.control_points = numbers[id(model.trajectory.module)]
         self.values = {v.name: numbers[id(v)] for v in model.variables}
@@ -90,12 +92,10 @@ class Result:
         """
         found: dict[str, Tensor] = {}
         for term in self._terms():
-            chunks = [r for _, _, r in term.linearize(self._state)]
-            rows = torch.from_numpy(np.concatenate([np.empty((0, term.kernel.rows)), *chunks]))
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
-            found[name] = torch.empty_like(rows).index_copy(0, torch.from_numpy(term.order), rows)
+            found[name] = torch.from_numpy(term.residuals(self._state))
         return found
 
     @cached_property
@@ -109,25 +109,61 @@ class Result:
     @property
     def variance_factor(self) -> float:
         """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
-        rows = sum(len(term) * term.kernel.rows for term in self._terms())
+        rows = sum(term.numbers for term in self._terms())
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
+
+    @cached_property
+    def redundancy(self) -> dict[str, float]:
+        """How many of the numbers of each residual were left to check the solution, by name as in `residuals`.
+
+        The trace of `I - J (J^T W J)^-1 J^T W`: numbers measured minus those that unknowns went along with. The
+        weighted sum of squares of a residual over its redundancy is 1 if its standard deviation was right
+        [Foerstner 1979].
+
+        Raises:
+            ValueError: the measurements do not determine all unknowns.
+        """
+        factor, found = self._determined(), {}
+        for name, term in zip(self.residuals, self._terms(), strict=True):
+            own = self._linearizer.system_of(term, self._state)
+            found[name] = term.numbers - factor.trace(own)
+        return found
 
     # ------------------------------------------------------------------ how sure
 
     @cached_property
-    def _factor(self) -> Factor:
+    def _undamped(self) -> Factor | None:
+        """None where it is singular."""
         try:
             return self._system.factor(np.zeros(self._linearizer.model.total))
         except SingularError:
+            return None
+
+    @property
+    def _factor(self) -> Factor:
+        if self._undamped is None:
             open_ = "; ".join(map(str, self.observability)) or "rounding leaves no direction to name"
-            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}") from None
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}")
+        return self._undamped
 
     def _determined(self) -> Factor:
-        if self.observability:
+        if not self._surely_determined and self.observability:
             raise ValueError(
                 f"covariance: the measurements do not determine all unknowns: {'; '.join(map(str, self.observability))}"
             )
         return self._factor
+
+    @cached_property
+    def _surely_determined(self) -> bool:
+        """Whether no direction is open, without looking for them.
+
+        The smallest eigenvalue is at least one over the trace of the inverse, here of the scaled equations.
+        """
+        diagonal = self._system.diagonal()
+        if not isinstance(self._system, BandSystem) or not (diagonal > 0).all() or self._undamped is None:
+            return False
+        inverse = self._undamped.diagonal()
+        return bool((inverse > 0).all()) and float(np.einsum("n,n->", inverse, diagonal)) < 1.0 / _OPEN
 
     def covariance(self, variable: Variable) -> Tensor:
         """Of a variable's step: `(dimension, dimension)`, or `(L, dimension, dimension)` for several.
@@ -145,9 +181,26 @@ class Result:
         blocks = torch.from_numpy(self._determined().inverse(i, j))
         return blocks[0] if variable.value.ndim == 1 else blocks
 
-    def standard_deviation(self, variable: Variable) -> Tensor:
-        """Square roots of the diagonal of `covariance`."""
-        return self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+    def standard_deviation(self, variable: Variable, stretch: float | None = None) -> Tensor:
+        """Square roots of the diagonal of `covariance`; with `stretch` also where errors are alike for a while.
+
+        Args:
+            stretch: s. Residuals may be correlated within stretches of the trajectory of this length, as they are where
+                a model is not exact or a bias wanders: the scatter of what stretches pull at counts then
+                (the cluster-robust covariance [Liang and Zeger 1986]), where it is larger. There are six at least.
+        Raises:
+            ValueError: as `covariance`; a stretch that is not above zero; too many variables for a band with a border.
+        """
+        own = self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+        if stretch is None:
+            return own
+        checks.positive("stretch", stretch)
+        if stretch not in self._scatter:
+            self._scatter[stretch] = scatter(self._linearizer, self._state, self._factor, stretch)
+        model = self._linearizer.model
+        columns = model.columns[id(variable)] - model.band
+        found = torch.from_numpy(np.sqrt(np.square(self._scatter[stretch][:, columns]).sum(axis=0)))
+        return torch.maximum(own, found.reshape(own.shape))
 
     def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
         """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.
@@ -186,9 +239,16 @@ class Result:
 
     # ------------------------------------------------------------------ what is left open
 
+    @property
+    def banded(self) -> bool:
+        """Whether the normal equations are a band with a narrow border, as `standard_deviation` wants for stretches."""
+        return isinstance(self._system, BandSystem)
+
     @cached_property
     def observability(self) -> list[OpenDirection]:
         """Combinations of unknowns that the measurements do not determine, at most a dozen; empty is good."""
+        if self._surely_determined:
+            return []
         diagonal = self._system.diagonal()
         dead = np.flatnonzero(diagonal <= 0)
         found = []
@@ -246,3 +306,18 @@ class Result:
             for i, spline in enumerate(model.splines)
         ]
         return names + [(variable.name, variable) for variable in model.variables]
+
+
+def control_point_deviation(result: Result, spline: BSpline) -> Tensor:
+    """Standard deviations of the steps of the control points of one of the problem's splines, `(M, D)`.
+
+    Those that stayed have 0.
+
+    Raises:
+        ValueError: the measurements do not determine all unknowns.
+    """
+    columns = result._linearizer.model.columns[id(spline)]
+    there = columns >= 0
+    variances = np.zeros(columns.shape)
+    variances[there] = result._determined().inverse(columns[there], columns[there])
+    return torch.from_numpy(np.sqrt(variances))

@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 
 from torchspline.fit.model import Model
 from torchspline.kernels.assemble import add_to_band, add_to_blocks
+from torchspline.kernels.band import inverse_band
 
 Array = NDArray[Any]
+
+
+#: Rows of a piece in `_inner`.
+_PIECE = 256
 
 
 class Rows(NamedTuple):
@@ -45,6 +50,14 @@ class Factor(ABC):
     @abstractmethod
     def inverse(self, i: Array, j: Array) -> Array:
         """Elements of the inverse at columns `i`, `j` of one shape, tied together by measurements or of the border."""
+
+    @abstractmethod
+    def diagonal(self) -> Array:
+        """Of the inverse."""
+
+    @abstractmethod
+    def trace(self, other: "System") -> float:
+        """Of the inverse times the `J^T J` of some of the same measurements."""
 
 
 class System(ABC):
@@ -140,7 +153,7 @@ class BandFactor(Factor):
         from scipy.linalg import lapack  # as long to import as the rest of the library
 
         n, m = len(system.band), len(system.corner)
-        self.n, self._lapack = n, lapack
+        self.n, self._lapack, self._fused = n, lapack, system.fused
         self.damped = system.band.copy()
         self.damped[:, 0] += damping[:n]
         self.chol = self.damped.T
@@ -150,7 +163,7 @@ class BandFactor(Factor):
                 raise SingularError
         self.border = system.border
         self.inverse_border = self._band_solve(system.border)
-        complement = system.corner + np.diag(damping[n:]) - np.tril(self.border.T @ self.inverse_border)
+        complement = system.corner + np.diag(damping[n:]) - np.tril(_inner(self.border, self.inverse_border))
         self.corner = complement
         if m:
             self.corner, info = lapack.dpotrf(complement, lower=1)
@@ -167,56 +180,86 @@ class BandFactor(Factor):
         inner = self._band_solve(right[:n])
         if len(right) == n:
             return inner
-        outer = right[n:] - self.border.T @ inner
+        outer = right[n:] - _inner(self.border, inner)
         outer = self._lapack.dpotrs(self.corner, outer, lower=1)[0]
         return np.concatenate([inner - self.inverse_border @ outer, outer])
 
     def inverse(self, i: Array, j: Array) -> Array:
-        """The band of the inverse of the band's factor [Takahashi 1973], corrected for the border."""
-        n, m = self.n, len(self.corner)
-        identity = np.eye(m)
-        corner = self._lapack.dpotrs(self.corner, identity, lower=1)[0] if m else identity
-        # Rows of [-A^-1 B; 1]: how all columns follow those of the border.
-        follow = np.concatenate([-self.inverse_border, identity]) if m else np.zeros((n, 0))
-        result = np.einsum("...a,ab,...b->...", follow[i], corner, follow[j])
+        """The band's own inverse, corrected for the border."""
+        n, follow = self.n, self._follow
+        result = np.einsum("...a,ab,...b->...", follow[i], self._inverse_corner, follow[j])
         inner = (i < n) & (j < n)
         result[inner] += self._band_inverse(i[inner], j[inner])
         return result
 
-    def _band_inverse(self, i: Array, j: Array) -> Array:
-        i, j = np.maximum(i, j), np.minimum(i, j)
-        diagonal, below = self._inverse_blocks
-        size = diagonal.shape[1]
-        here, there = i // size, j // size
-        if len(i) and int((here - there).max()) > 1:
+    def trace(self, other: System) -> float:
+        assert isinstance(other, BandSystem)
+        width = min(other.band.shape[1], self._inverse.shape[1])
+        if other.band[:, width:].any():
             raise ValueError("these columns are too far apart for elements of the inverse to be known")
-        same = here == there
-        first = np.minimum(there, len(below) - 1) if len(below) else there
-        apart = below[first, i % size, j % size] if len(below) else np.zeros(len(i))
-        return np.where(same, diagonal[here, i % size, j % size], apart)
+        corner = other.corner + np.tril(other.corner, -1).T
+        total = float(np.einsum("ab,ab->", self._inverse_corner, corner))
+        total += 2.0 * float(np.einsum("nm,nm->", self._inverse_border, other.border))
+        below = float(np.einsum("nd,nd->", self._whole_inverse[:, 1:width], other.band[:, 1:width]))
+        return total + 2.0 * below + float(np.einsum("n,n->", self._whole_inverse[:, 0], other.band[:, 0]))
+
+    def border_steps(self, columns: Array) -> Array:
+        """Rows `(..., m)` of the inverse at `columns`: how the border moves with a gradient there."""
+        return self._follow[columns] @ self._inverse_corner
+
+    def diagonal(self) -> Array:
+        """Of the inverse."""
+        return np.concatenate([self._whole_inverse[:, 0], np.diagonal(self._inverse_corner)])
+
+    def _band_inverse(self, i: Array, j: Array) -> Array:
+        first, apart = np.minimum(i, j), np.abs(i - j)
+        if len(apart) and int(apart.max()) >= self._inverse.shape[1]:
+            raise ValueError("these columns are too far apart for elements of the inverse to be known")
+        return self._inverse[first, apart]
 
     @cached_property
-    def _inverse_blocks(self) -> tuple[Array, Array]:
-        """The inverse's blocks on the diagonal and below it, as wide as the band."""
-        width, n = self.chol.shape
-        size = max(width - 1, 1)
-        count = -(-n // size)
-        # The factor in blocks: with a band as wide as a block there is one on the diagonal and one below it.
-        dense = np.zeros((count, 2 * size, size))
-        column, down = np.meshgrid(np.arange(n), np.arange(width), indexing="ij")
-        block, at = column // size, column % size
-        keep = column + down < n
-        dense[block[keep], (at + down)[keep], at[keep]] = self.chol.T[column[keep], down[keep]]
-        dense[-1, np.arange(size), np.arange(size)] += np.arange(size) >= n - (count - 1) * size
-        diagonal, below = np.empty((count, size, size)), np.empty((max(count - 1, 0), size, size))
-        for b in reversed(range(count)):
-            inverse = np.linalg.inv(dense[b, :size])
-            diagonal[b] = inverse.T @ inverse
-            if b < count - 1:
-                carried = dense[b, size:] @ inverse
-                below[b] = -diagonal[b + 1] @ carried
-                diagonal[b] += carried.T @ diagonal[b + 1] @ carried
-        return diagonal, below
+    def _inverse(self) -> Array:
+        """`[j, d]`: element `(j + d, j)` of the inverse of the band alone."""
+        return inverse_band(self._fused, self.chol.T)
+
+    @cached_property
+    def _whole_inverse(self) -> Array:
+        """The same of the inverse of all."""
+        n, follow, result = self.n, self._follow[: self.n], self._inverse.copy()
+        for d in range(min(result.shape[1], n)):
+            result[: n - d, d] += np.einsum("na,na->n", self._inverse_border[d:], follow[: n - d])
+        return result
+
+    @cached_property
+    def _inverse_border(self) -> Array:
+        """The part of the inverse between band and border."""
+        return self._follow[: self.n] @ self._inverse_corner
+
+    @cached_property
+    def _inverse_corner(self) -> Array:
+        """The border's part of the inverse."""
+        identity = np.eye(len(self.corner))
+        return self._lapack.dpotrs(self.corner, identity, lower=1)[0] if len(identity) else identity
+
+    @cached_property
+    def _follow(self) -> Array:
+        """Rows of [-A^-1 B; 1]: how all columns follow those of the border."""
+        return np.concatenate([-self.inverse_border, np.eye(len(self.corner))])
+
+
+def _inner(a: Array, b: Array) -> Array:
+    """`a^T b` of tall matrices `(n, m)` and `(n, ...)`, in pieces that a BLAS does not give to several threads.
+
+    The product takes a millisecond; waiting for a thread that another process keeps off its core takes hundreds.
+    """
+    right = b.reshape(len(b), int(np.prod(b.shape[1:])))  # -1 cannot be told where there are no rows
+    pieces, rest = divmod(len(a), _PIECE)
+    whole = pieces * _PIECE
+    first, second = (x[:whole].reshape(pieces, _PIECE, x.shape[1]) for x in (a, right))
+    total = (first.transpose(0, 2, 1) @ second).sum(axis=0)
+    if rest:
+        total = total + a[whole:].T @ right[whole:]
+    return total.reshape(a.shape[1], *b.shape[1:])
 
 
 class SparseSystem(System):
@@ -289,3 +332,12 @@ class SparseFactor(Factor):
         unit = np.zeros((self._lu.shape[0], len(needed)))
         unit[needed, np.arange(len(needed))] = 1.0
         return self._lu.solve(unit)[i, which.reshape(j.shape)]
+
+    def diagonal(self) -> Array:
+        columns = np.arange(self._lu.shape[0])
+        return self.inverse(columns, columns)
+
+    def trace(self, other: System) -> float:
+        assert isinstance(other, SparseSystem)
+        matrix = other.matrix().tocoo()
+        return float(self.inverse(matrix.row, matrix.col) @ matrix.data)

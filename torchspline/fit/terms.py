@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -38,6 +38,29 @@ class Places(NamedTuple):
     rates: list[tuple[Variable, Array]]
 
 
+class Kernel(Protocol):
+    """What a term has to know of the kind of its residual."""
+
+    #: Slots in which the residual was given arguments, and numbers of a residual.
+    order: list[str]
+    rows: int
+    #: For each moment which parts of its state (value, velocity, ...) the residual depends on.
+    parts: list[tuple[bool, ...]]
+
+
+class Differential(NamedTuple):
+    """Residuals (N, R) of a chunk and how they move."""
+
+    residual: Array
+    #: The weighted residual, the weights that its Jacobian takes, too, and the cost of each measurement.
+    error: Array
+    weight: Array | None
+    costs: Array
+    #: Cotangents (N, R, C) of the states at each moment and of the arguments, not weighted.
+    moments: list[Array]
+    slots: list[Array]
+
+
 class Term:
     """A residual bound to the unknowns of a problem."""
 
@@ -59,7 +82,7 @@ class Term:
             (slot, isinstance(x, BSpline) or slot in index or slot in self.each)
             for slot, x in residual.arguments.items()
         )
-        self.kernel: ResidualKernel = kernel_of(kind, model.trajectory.name, given)
+        self.kernel = self._kernel(given)
         self.weights = self._weights()
         self.clock = [v for v in residual.clock.unknowns if id(v) in model.columns]
         self.splines = {
@@ -78,6 +101,14 @@ class Term:
 
     def __len__(self) -> int:
         return len(self.order)
+
+    def _kernel(self, given: tuple[tuple[str, bool], ...]) -> Kernel:
+        return kernel_of(type(self.residual), self.model.trajectory.name, given)
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers were measured."""
+        return len(self) * self.kernel.rows
 
     def _weights(self) -> Array | None:
         """Square roots of the information: None, (N or 1, R or 1), or (N or 1, R, R)."""
@@ -205,17 +236,14 @@ class Term:
             yield slice(begin, stop), costs, part, residual
 
     def _chunk(self, state: State, places: Places, part: slice) -> tuple[Array, Array, Array]:
-        model, kernel = self.model, self.kernel
-        spline, local = model.trajectory, state.local
+        kernel, spline, local = self.kernel, self.model.trajectory, state.local
         assert local is not None
         derivatives = type(self.residual).derivatives + (1 if self.clock else 0)
         base, u = [b[part] for b in places.base], [x[part] for x in places.u]
         states = [spline.local.evaluate(local, b, x, derivatives) for b, x in zip(base, u, strict=True)]
-        kept = type(self.residual).derivatives + 1
-        arrays = [x for s in states for x in s[:kept]] + [self.measured[part]]
-        arrays += [self._argument(slot, state, places, part) for slot in kernel.order]
-        residual, *cotangents = kernel.linearize(arrays, spline.local.fused)
-        moments, slots = cotangents[: len(base)], cotangents[len(base) :]
+        found = self._differentiate(state, places, part, states)
+        residual, error, weight, costs = found.residual, found.error, found.weight, found.costs
+        moments, slots = found.moments, found.slots
         times = [
             sum(np.einsum("nrc,nc->nr", g, _pick(s[1:], parts)) * rate[m, part][:, None]
                 for m, (g, s, parts) in enumerate(zip(moments, states, kernel.parts, strict=True)))
@@ -224,7 +252,6 @@ class Term:
         width = places.columns.shape[1] + 1
         N, R = residual.shape
         rows = np.empty((N, R, width))
-        error, weight, costs = self._weigh(residual, part, places.outside[part])
         rows[..., -1] = error
         at = 0
         for g, b, x, parts in zip(moments, base, u, kernel.parts, strict=True):
@@ -251,6 +278,28 @@ class Term:
             rows[..., at] = _apply(weight, column[..., None])[..., 0]
             at += 1
         return costs, rows, residual
+
+    def _differentiate(
+        self, state: State, places: Places, part: slice, states: list[list[Array]]
+    ) -> "Differential":
+        """Residuals, and how they move with states and arguments."""
+        kernel, kept = self.kernel, type(self.residual).derivatives + 1
+        assert isinstance(kernel, ResidualKernel)
+        arrays = [x for s in states for x in s[:kept]] + [self.measured[part]]
+        arrays += [self._argument(slot, state, places, part) for slot in kernel.order]
+        residual, *cotangents = kernel.linearize(arrays, self.model.trajectory.local.fused)
+        error, weight, costs = self._weigh(residual, part, places.outside[part])
+        return Differential(
+            residual, error, weight, costs, cotangents[: len(states)], cotangents[len(states) :]
+        )
+
+    def residuals(self, state: State) -> Array:
+        """Of all measurements, (N, R) in the order in which they were given, not weighted."""
+        chunks = [residual for *_, residual in self.linearize(state)]
+        rows = np.concatenate([np.empty((0, self.kernel.rows)), *chunks])
+        result = np.empty_like(rows)
+        result[self.order] = rows
+        return result
 
     def _argument(self, slot: str, state: State, places: Places, part: slice) -> Array:
         """Numbers of an argument: one for all measurements, or one each."""

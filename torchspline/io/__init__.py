@@ -1,4 +1,5 @@
-"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`.
+"""Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`; and what
+calibration finds: `read_imu_parameters`, `read_camchain` and their writers.
 
 Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`. Bags of
 ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
@@ -11,6 +12,8 @@ import torch
 
 from torchspline.io import euroc, kitti, ros, tum
 from torchspline.io.bvh import Skeleton, read_bvh
+from torchspline.io.camchain import CamChain, read_camchain, write_camchain
+from torchspline.io.camera import Camera
 from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
 from torchspline.io.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchspline.io.records import ImuRecord, PoseRecord
@@ -20,17 +23,21 @@ from torchspline.io.text import Table, read_table
 from torchspline.io.trajectory import load_trajectory, save_trajectory
 
 __all__ = [
+    "CamChain",
+    "Camera",
     "ImuParameters",
     "ImuRecord",
     "PoseRecord",
     "Skeleton",
     "load_trajectory",
     "read_bvh",
+    "read_camchain",
     "read_imu",
     "read_imu_parameters",
     "read_nerfstudio",
     "read_poses",
     "save_trajectory",
+    "write_camchain",
     "write_imu",
     "write_imu_parameters",
     "write_nerfstudio",

@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 
 DEPTH = {DEPTH}
+FEW = {FEW}
 
 '''
 _OPTIONS = 'nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}'
@@ -30,6 +31,8 @@ _HELPER = f"@njit({_OPTIONS})\n"
 
 #: Rows of a run that are multiplied at a time.
 DEPTH = 128
+#: Runs of fewer rows than this share of the columns are moved to control points before they are multiplied.
+FEW = 1
 
 
 def outer_products(lines, depth, gram):
@@ -54,50 +57,60 @@ def outer_products(lines, depth, gram):
             g3[0], g3[1], g3[2], g3[3] = g3[0] + s30, g3[1] + s31, g3[2] + s32, g3[3] + s33
 
 
-def run_gram(rows, begin, stop, bases, chain, order, size, lines, gram, moved):
+def run_gram(rows, begin, stop, bases, chain, order, size, lines, lined, gram, moved):
     """`gram` = sum of the outer products of the rows of queries `begin` to `stop`, in control points.
 
     Args:
         rows: (N, R, W). bases: first control point of each spline's part of the columns. chain: (M, 2, D, D) of the
-            logarithms. order, size: k and D. lines, gram, moved: from `workspace`.
+            logarithms. order, size: k and D. lines, lined, gram, moved: from `workspace`.
     """
     width = rows.shape[2]
     gram[:] = 0.0
     depth = 0
+    few = (stop - begin) * rows.shape[1] <= min(lines.shape[1], FEW * width) and len(bases) > 0
     for n in range(begin, stop):
         for r in range(rows.shape[1]):
             for a in range(width):
                 lines[a, depth] = rows[n, r, a]
             depth += 1
-            if depth == lines.shape[1]:
+            if depth == lines.shape[1] and not few:
                 outer_products(lines, depth, gram)
                 depth = 0
-    outer_products(lines, depth, gram)
+    if few:  # cheaper to move the rows than their products
+        to_points(lines, bases, chain, order, size, lined, depth)
+        outer_products(lined, depth, gram)
+    else:
+        outer_products(lines, depth, gram)
     for a in range(width):
         for b in range(a):
             gram[b, a] = gram[a, b]
-    if len(bases) > 0:
-        to_points(gram, bases, chain, order, size, moved)
+    if len(bases) > 0 and not few:
+        to_points(gram, bases, chain, order, size, moved, gram.shape[1])
         for a in range(width):
             for b in range(width):
                 gram[a, b] = moved[b, a]
-        to_points(gram, bases, chain, order, size, moved)
+        to_points(gram, bases, chain, order, size, moved, gram.shape[1])
         gram[:] = moved
 
 
 def workspace(width, like):
-    """Room for `run_gram`: the lines of some rows and two square matrices, a multiple of four wide."""
+    """Room for `run_gram`: the lines of some rows, twice, and two square matrices, a multiple of four wide."""
     padded = (width + 3) // 4 * 4
-    square = (padded, padded)
-    return np.zeros((padded, DEPTH), like.dtype), np.zeros(square, like.dtype), np.zeros(square, like.dtype)
+    square, oblong = (padded, padded), (padded, DEPTH)
+    return (
+        np.zeros(oblong, like.dtype),
+        np.zeros(oblong, like.dtype),
+        np.zeros(square, like.dtype),
+        np.zeros(square, like.dtype),
+    )
 
 
-def to_points(local, bases, chain, order, size, moved):
-    """`moved` = T^T `local`, T from control points to local coordinates: logarithm j moves with its two points.
+def to_points(local, bases, chain, order, size, moved, width):
+    """`moved` = T^T `local`, of the first `width` columns; T leads from control points to local coordinates.
 
-    Six rows are added at a time: the loop over columns is short, and starting it costs more than a few products.
+    Logarithm j moves with its two points. Six rows are added at a time: the loop over columns is short, and starting it
+    costs more than a few products.
     """
-    width = local.shape[1]
     for a in range(local.shape[0]):
         for b in range(width):
             moved[a, b] = local[a, b]
@@ -142,10 +155,12 @@ def to_band(rows, starts, bases, chain, order, size, columns, band, border, corn
         How many products fell outside the band.
     """
     width = rows.shape[2]
-    lines, gram, moved = workspace(width, rows)
+    lines, lined, gram, moved = workspace(width, rows)
     n, reach, outside = band.shape[0], band.shape[1], 0
     for run in range(len(starts) - 1):
-        run_gram(rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, gram, moved)
+        run_gram(
+            rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved
+        )
         for a in range(width - 1):
             i = columns[run, a]
             if i < 0:
@@ -170,9 +185,11 @@ def to_band(rows, starts, bases, chain, order, size, columns, band, border, corn
 def to_blocks(rows, starts, bases, chain, order, size, columns, blocks, right):
     """The same for a sparse matrix: `blocks[run]` (W - 1, W - 1) of `J^T J`, and `right` as above."""
     width = rows.shape[2]
-    lines, gram, moved = workspace(width, rows)
+    lines, lined, gram, moved = workspace(width, rows)
     for run in range(len(starts) - 1):
-        run_gram(rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, gram, moved)
+        run_gram(
+            rows, starts[run], starts[run + 1], bases[run], chain, order, size, lines, lined, gram, moved
+        )
         for a in range(width - 1):
             for b in range(width - 1):
                 blocks[run, a, b] = gram[a, b]
@@ -219,7 +236,7 @@ def fast(loop: Callable) -> Callable:
     """The compiled form of one of the loops above."""
     name = loop.__name__
     helpers = [_HELPER + inspect.getsource(f) for f in (outer_products, to_points, workspace, run_gram)]
-    source = _HEADER.replace("{DEPTH}", str(DEPTH)) + "\n\n".join(
+    source = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", str(FEW)) + "\n\n".join(
         [*helpers, _ENTRY + inspect.getsource(loop)]
     )
     return compiled(name, source, _SIGNATURES[name])

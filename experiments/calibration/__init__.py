@@ -1,0 +1,1 @@
+"""Parts of the experiment `camera_imu.py`."""
