@@ -174,6 +174,7 @@ class Explorer:
 
     def curves(self, samples: int = 300) -> tuple[list[Curve], dict[str, str]]:
         """The curves of the methods chosen, and what was wrong with those that made none."""
+        checks.whole("samples", samples, least=2)
         found, wrong = [], {}
         for method in self.methods:
             try:

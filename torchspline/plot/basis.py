@@ -27,7 +27,11 @@ def basis_functions(method: str | int, times: Tensor, t: Tensor, derivative: int
         times: (M,) times of the keys, s, increasing; of a uniform B-spline where its control points act most.
         t: (N,) s.
         derivative: 0 to 3, of the functions by time.
+    Raises:
+        TypeError, ValueError: an unknown method, a wrong type, shape or value, a time outside the domain.
     """
+    times = _checked(method, times)
+    checks.choice("derivative", derivative, (0, 1, 2, 3))  # type: ignore[arg-type]
     keys = torch.eye(len(times), dtype=torch.float64)[..., None]
     if isinstance(method, int):
         dt = float(times[1] - times[0])
@@ -65,27 +69,10 @@ def basis(
     Raises:
         TypeError, ValueError: an unknown method, a wrong type, shape or value.
     """
-    checks.is_floating_tensor("times", times)
-    if isinstance(method, bool) or not isinstance(method, (str, int)):
-        raise TypeError(f"method: expected a name or the order of a B-spline, got {type(method).__name__}")
-    least = 2
-    if isinstance(method, int):
-        checks.whole("method", method, least=2)
-        least = method
-    elif method.lower() not in {name.lower() for name in (*SURVEY, *SCHEMES)}:
-        raise ValueError(f"method: expected one of {', '.join([*SURVEY, *SCHEMES])}, got {method!r}")
-    if times.ndim != 1 or len(times) < least:
-        raise ValueError(f"times: expected shape (M,), M at least {least}, got {tuple(times.shape)}")
-    checks.finite("times", times)
-    times = times.detach().to("cpu", torch.float64)
-    steps = times.diff()
-    if bool((steps <= 0).any()):
-        raise ValueError("times: expected increasing times, got equal or falling ones")
+    times = _checked(method, times)
     first, last = float(times[0]), float(times[-1])
     if isinstance(method, int):
-        if float(steps.max() - steps.min()) > 1e-6 * float(steps.mean()):
-            raise ValueError(f"times: expected evenly spaced times for a B-spline, got {times.tolist()}")
-        inset = (method - 2) / 2 * float(steps[0])
+        inset = (method - 2) / 2 * float(times[1] - times[0])
         first, last = first + inset, last - inset
     shares = torch.linspace(0.0, 1.0, SAMPLES, dtype=torch.float64)
     t = (first + (last - first) * shares).clamp(first, last)
@@ -109,3 +96,26 @@ def basis(
         )
     axes.set_title(title or (f"uniform B-spline of order {method}" if isinstance(method, int) else method))
     return figure
+
+
+def _checked(method: str | int, times: Tensor) -> Tensor:
+    """The times in float64 on the CPU, if they and the method are as they should be."""
+    checks.is_floating_tensor("times", times)
+    if isinstance(method, bool) or not isinstance(method, (str, int)):
+        raise TypeError(f"method: expected a name or the order of a B-spline, got {type(method).__name__}")
+    least = 2
+    if isinstance(method, int):
+        checks.whole("method", method, least=2)
+        least = method
+    elif method.lower() not in {name.lower() for name in (*SURVEY, *SCHEMES)}:
+        raise ValueError(f"method: expected one of {', '.join([*SURVEY, *SCHEMES])}, got {method!r}")
+    if times.ndim != 1 or len(times) < least:
+        raise ValueError(f"times: expected shape (M,), M at least {least}, got {tuple(times.shape)}")
+    checks.finite("times", times)
+    times = times.detach().to("cpu", torch.float64)
+    steps = times.diff()
+    if bool((steps <= 0).any()):
+        raise ValueError("times: expected increasing times, got equal or falling ones")
+    if isinstance(method, int) and float(steps.max() - steps.min()) > 1e-6 * float(steps.mean()):
+        raise ValueError(f"times: expected evenly spaced times for a B-spline, got {times.tolist()}")
+    return times

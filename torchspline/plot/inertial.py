@@ -28,6 +28,13 @@ def imu_comparison(
     """
     for name, pair in (("lines", lines), ("dots", dots)):
         if pair is not None:
+            if not isinstance(pair, tuple) or len(pair) != 2 or not isinstance(pair[1], ImuReading):
+                raise TypeError(f"{name}: expected (times, ImuReading), got {type(pair).__name__}")
+            checks.is_floating_tensor(f"{name}: times", pair[0])
+            if pair[0].shape != pair[1].gyroscope.shape[:1]:
+                raise ValueError(
+                    f"{name}: expected times of shape {tuple(pair[1].gyroscope.shape[:1])}, got {tuple(pair[0].shape)}"
+                )
             checks.has_last(f"{name}: gyroscope", pair[1].gyroscope, 3, "x, y, z")
             checks.has_last(f"{name}: accelerometer", pair[1].accelerometer, 3, "x, y, z")
     figure = new_figure(11, 7)
@@ -84,6 +91,9 @@ def allan_panel(
     axes: Any, deviations: Mapping[str, AllanDeviation], fits: Mapping[str, NoiseEstimate] | None = None
 ) -> None:
     """The same on `axes` of Matplotlib, without titles."""
+    for name, x in (("deviations", deviations), ("fits", {} if fits is None else fits)):
+        if not isinstance(x, Mapping):
+            raise TypeError(f"{name}: expected a mapping of names, got {type(x).__name__}")
     for i, (name, found) in enumerate(deviations.items()):
         checks.instance(f"deviations[{name!r}]", found, AllanDeviation, "an AllanDeviation")
         tau = numbers(found.tau)
@@ -94,6 +104,7 @@ def allan_panel(
             axes.loglog(tau, curve, color=f"C{i}", linewidth=1.2, label=None if j else name)
             axes.fill_between(tau, lower[j], upper[j], color=f"C{i}", alpha=0.12, linewidth=0)
         if fits and name in fits:
+            checks.instance(f"fits[{name!r}]", fits[name], NoiseEstimate, "a NoiseEstimate")
             parts = [
                 allan_variance(part, numbers(found.clusters), found.interval) * numbers(x.reshape(-1, 1)) ** 2
                 for part, x in fits[name].coefficient.items()
