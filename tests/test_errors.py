@@ -13,6 +13,7 @@ import error_imu_allan
 import error_imu_earth
 import error_imu_noise
 import error_imu_strapdown
+import error_interop
 import error_online
 import error_robot
 import error_splines
@@ -37,6 +38,7 @@ FILES = (
     error_imu_allan,
     error_imu,
     error_generate,
+    error_interop,
     error_robot,
     error_splines,
     error_calibration_files,

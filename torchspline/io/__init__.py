@@ -1,8 +1,9 @@
 """Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`; and what
 calibration finds: `read_imu_parameters`, `read_camchain` and their writers.
 
-Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`. Bags of
-ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
+Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`.
+Bags of ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends
+with its `FORMAT` and name the module in `_FORMATS` below.
 """
 
 from os import PathLike
@@ -62,8 +63,8 @@ def read_poses(
             a bag).
         format: "euroc", "kitti", "ros" or "tum"; found from the content when not given.
         times: the file of stamps, for KITTI only; looked for beside the poses when not given.
-        topic: of a ROS bag, with PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry messages; the only
-            one there is when not given. Messages are stamped by their headers.
+        topic: of a ROS bag, with PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry messages; the
+            only one there is when not given. Messages are stamped by their headers.
     Returns:
         PoseRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
     Raises:
@@ -79,9 +80,7 @@ def read_poses(
     return chosen.read_poses(table, None if times is None else Path(times))
 
 
-def read_imu(
-    path: str | PathLike[str], format: str | None = None, topic: str | None = None
-) -> ImuRecord:
+def read_imu(path: str | PathLike[str], format: str | None = None, topic: str | None = None) -> ImuRecord:
     """Read stamped IMU samples: rad/s, specific force in m/s^2, exact nanoseconds.
 
     Args:

@@ -4,6 +4,7 @@ import gzip
 import io
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -27,8 +28,17 @@ _DAMAGED = (
     RuntimeError,
     ValueError,
     OverflowError,
+    # Of the parser of headers, which are written as Python:
+    tokenize.TokenError,
+    SyntaxError,
+    TypeError,
+    LookupError,
 )
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+class _NoNumbersError(ValueError):
+    """An array that is none of plain numbers, or is not as large as its header says."""
 
 
 def allowed_size(stored: int) -> int:
@@ -89,9 +99,13 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return {info.filename.removesuffix(".npy"): _array(archive, info) for info in members}
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
+    except _NoNumbersError as reason:
+        raise ValueError(f"{path}: {reason}") from None
     except _DAMAGED as reason:
         text = " ".join(str(reason).split())[:200]
-        raise ValueError(f"{path}: expected an npz archive of numbers, got a damaged one ({text})") from None
+        raise ValueError(
+            f"{path}: expected an npz archive of numbers, got a damaged or truncated file ({text})"
+        ) from None
 
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
@@ -115,7 +129,10 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     shape, column_major, dtype = _HEADERS[version](file)
     promised = math.prod(shape) * dtype.itemsize
     if dtype.kind not in "biuf" or min(shape, default=0) < 0 or file.tell() + promised != info.file_size:
-        raise ValueError(f"{info.filename}: {dtype} of shape {shape} in {info.file_size} bytes")
+        name, got = info.filename.removesuffix(".npy")[:40], f"{dtype} of shape {shape}"[:80]
+        raise _NoNumbersError(
+            f"{name}: expected an array of plain numbers, got {got} in {info.file_size} bytes"
+        )
     flat = np.frombuffer(file.getbuffer()[file.tell() :], dtype=dtype.newbyteorder("="))
     if not dtype.isnative:
         flat = flat.byteswap()

@@ -37,8 +37,8 @@ def read_nerfstudio(path: str | PathLike[str], fps: float | None = None) -> Pose
 
     Args:
         path: the file, plain or gzipped; which of the two it is, its content tells.
-        fps: frames per second, Hz: frame i is stamped i / fps. By default as the file has it: the `fps` of a camera path,
-            the `time` of each frame (s) of a data set.
+        fps: frames per second, Hz: frame i is stamped i / fps. By default as the file has it: the `fps` of a camera
+            path, the `time` of each frame (s) of a data set.
     Returns:
         PoseRecord: cameras that look along +z with y down, in the units of the file; rotations that were rounded are
         made rotations again.
@@ -53,10 +53,14 @@ def read_nerfstudio(path: str | PathLike[str], fps: float | None = None) -> Pose
     if fps is not None:
         checks.positive("fps", fps)
     content = _load(path)
-    key, entry = ("camera_path", "camera_to_world") if "camera_path" in content else ("frames", "transform_matrix")
+    key, entry = (
+        ("camera_path", "camera_to_world") if "camera_path" in content else ("frames", "transform_matrix")
+    )
     frames = content.get(key)
     if not isinstance(frames, list) or not frames:
-        raise ValueError(f"{path}: expected a list of frames or camera_path that is not empty, got {_short(frames)}")
+        raise ValueError(
+            f"{path}: expected a list of frames or camera_path that is not empty, got {_short(frames)}"
+        )
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or entry not in frame:
             raise ValueError(f"{path}: {key}[{i}]: expected {entry} in it, got {_short(frame)}")

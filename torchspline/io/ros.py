@@ -1,6 +1,8 @@
 """ROS bags, of ROS 1 and 2 (MCAP and SQLite), through the package rosbags: no ROS needed."""
 
-from collections.abc import Iterator, Mapping
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from os import PathLike
@@ -26,6 +28,13 @@ _POSES = {
     "geometry_msgs/msg/TransformStamped": "transform",
     "nav_msgs/msg/Odometry": "pose.pose",
 }
+#: What messages are made of.
+_MADE_OF = (
+    "builtin_interfaces/msg/Time",
+    "std_msgs/msg/Header",
+    "sensor_msgs/msg/Imu",
+    *(f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "Pose", "Point", "Quaternion", "Vector3")),
+)
 #: Who the poses of a bag that is written belong to, and its IMUs.
 _WORLD, _SENSOR = "world", "imu"
 
@@ -62,14 +71,16 @@ def read_imu(path: Path, topic: str | None) -> ImuRecord:
 
 
 def write_rosbag(path: str | PathLike[str], records: Mapping[str, PoseRecord | ImuRecord]) -> None:
-    """Write a bag of ROS 2 (MCAP) with poses (`geometry_msgs/PoseStamped` in `world`) and IMU samples (`sensor_msgs/Imu`
-    in `imu`, without orientation); reading it back gives the same stamps and float64 numbers.
+    """Write a bag of ROS 2 (MCAP); reading it back gives the same stamps and float64 numbers.
+
+    Poses become `geometry_msgs/PoseStamped` in the frame `world`, IMU samples `sensor_msgs/Imu` in `imu`, without
+    orientation.
 
     Args:
         path: the folder of the bag, which must not exist.
         records: by topic, such as `{"/imu": samples, "/pose": poses}`.
     Raises:
-        FileExistsError: there is something at `path`. FileNotFoundError: the folder that it is to stand in is not there.
+        FileExistsError: there is something at `path`. FileNotFoundError: the folder it is to stand in is not there.
         ImportError: the package rosbags is not installed.
         ValueError: no records, an empty one, or stamps that such messages cannot hold (before 1970, after 2038).
     """
@@ -78,11 +89,13 @@ def write_rosbag(path: str | PathLike[str], records: Mapping[str, PoseRecord | I
     path = Path(path)
     _check_records(records)
     if path.exists():
-        raise FileExistsError(f"{path}: expected a folder that does not exist yet; remove it or choose another name")
+        raise FileExistsError(
+            f"{path}: expected a folder that does not exist yet; remove it or choose another name"
+        )
     check_folder(path)
     rosbag2, typesys = _library("rosbag2"), _library("typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    make = {name.split("/")[-1]: store.types[name] for name in store.types}
+    make = {name.split("/")[-1]: store.types[name] for name in _MADE_OF}
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     with writer:
         for topic, record in records.items():
@@ -94,16 +107,21 @@ def write_rosbag(path: str | PathLike[str], records: Mapping[str, PoseRecord | I
 
 def _written(record: PoseRecord | ImuRecord, make: Mapping[str, Any]) -> Iterator[tuple[int, Any]]:
     vector, quaternion, unknown = make["Vector3"], make["Quaternion"], np.zeros(9)
-    imu = isinstance(record, ImuRecord)
-    columns = (record.gyroscope, record.accelerometer) if imu else (record.position, record.rotation)
+    if isinstance(record, ImuRecord):
+        imu, columns = True, (record.gyroscope, record.accelerometer)
+    else:
+        imu, columns = False, (record.position, record.rotation)
     for time_ns, first, second in zip(record.time_ns.tolist(), *(x.tolist() for x in columns), strict=True):
         stamp = make["Time"](*divmod(time_ns, _NS))
         if imu:
             header = make["Header"](stamp, _SENSOR)
             nowhere = quaternion(0.0, 0.0, 0.0, 1.0)
             no_orientation = np.array([-1.0, *unknown[1:]])
-            yield time_ns, make["Imu"](
-                header, nowhere, no_orientation, vector(*first), unknown, vector(*second), unknown
+            yield (
+                time_ns,
+                make["Imu"](
+                    header, nowhere, no_orientation, vector(*first), unknown, vector(*second), unknown
+                ),
             )
         else:
             w, x, y, z = second
@@ -118,7 +136,9 @@ def _check_records(records: Mapping[str, PoseRecord | ImuRecord]) -> None:
         raise ValueError("records: expected at least one record, got none")
     for topic, record in records.items():
         checks.instance("records", topic, str, "topics that are words")
-        checks.instance(f"records[{topic!r}]", record, (PoseRecord, ImuRecord), "a PoseRecord or an ImuRecord")  # type: ignore[arg-type]
+        if not isinstance(record, (PoseRecord, ImuRecord)):
+            got = type(record).__name__
+            raise TypeError(f"records[{topic!r}]: expected a PoseRecord or an ImuRecord, got {got}")
         if len(record) == 0:
             raise ValueError(f"records[{topic!r}]: expected rows to write, got an empty record")
         outside = (record.time_ns < 0) | (record.time_ns >= 2**31 * _NS)
@@ -134,9 +154,27 @@ def _stamp(message: Any) -> int:
     return stamp.sec * _NS + stamp.nanosec
 
 
-def _columns(rows: list[tuple[int, tuple[float, ...]]], width: int) -> tuple[Tensor, Tensor]:
+def _columns(rows: Sequence[tuple[int, tuple[float, ...]]], width: int) -> tuple[Tensor, Tensor]:
     stamps = torch.tensor([t for t, _ in rows], dtype=torch.int64)
     return stamps, torch.tensor([x for _, x in rows], dtype=torch.float64).reshape(-1, width)
+
+
+class _BoundedReader(io.BufferedReader):
+    """Reads no more than there is: lengths in damaged files would reserve memory of their size."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > io.DEFAULT_BUFFER_SIZE:
+            size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
+        return super().read(size)
+
+
+class _BoundedPath(type(Path())):  # type: ignore[misc]
+    """A path whose files are opened for bounded reading."""
+
+    def open(self, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+        if mode == "rb" and not arguments and not options:
+            return _BoundedReader(io.FileIO(str(self)))
+        return super().open(mode, *arguments, **options)
 
 
 @contextmanager
@@ -150,14 +188,15 @@ def _messages(path: Path, topic: str | None, kinds: tuple[str, ...], what: str) 
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     chosen = ""
     try:
-        with highlevel.AnyReader([path], default_typestore=store) as reader:
+        with highlevel.AnyReader([_BoundedPath(path)], default_typestore=store) as reader:
             topics = {c.topic: c.msgtype for c in reader.connections}
             fitting = [name for name, kind in topics.items() if kind in kinds and topic in (None, name)]
             if len(fitting) == 1:
                 chosen = fitting[0]
                 connections = [c for c in reader.connections if c.topic == chosen and c.msgtype in kinds]
                 yield (
-                    (c.msgtype, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages(connections)
+                    (c.msgtype, reader.deserialize(raw, c.msgtype))
+                    for c, _, raw in reader.messages(connections)
                 )
     except (MemoryError, ImportError, GeneratorExit):
         raise
@@ -175,4 +214,6 @@ def _library(name: str) -> Any:
     try:
         return import_module(f"rosbags.{name}")
     except ImportError as reason:
-        raise ImportError(f"ROS bags need the package rosbags: pip install 'torchspline[ros]' ({reason})") from None
+        raise ImportError(
+            f"ROS bags need the package rosbags: pip install 'torchspline[ros]' ({reason})"
+        ) from None

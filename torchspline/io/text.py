@@ -34,7 +34,10 @@ def parse_seconds(field: str) -> int:
     """
     if not _DECIMAL.fullmatch(field):
         raise ValueError("a finite number of seconds")
-    seconds = Decimal(field)
+    try:
+        seconds = Decimal(field)
+    except ArithmeticError:  # an exponent of twenty digits
+        return _checked(_INT64.stop)
     if seconds and seconds.adjusted() > 10:  # before an exponent such as 1e999999 becomes an integer
         return _checked(_INT64.stop)
     return _checked(int(seconds.scaleb(9, _EXACT).to_integral_value(ROUND_HALF_EVEN)))
@@ -90,6 +93,7 @@ class Table:
 
     def error(self, row: int, got: str, expected: str) -> ValueError:
         """A `ValueError` that names the file, the line, what came and what was expected."""
+        got = got if len(got) <= 120 else f"{got[:117]}..."
         return ValueError(f"{self.path}, line {self.lines[row]}: expected {expected}, got {got}")
 
     def excerpt(self, row: int) -> str:

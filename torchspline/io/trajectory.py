@@ -19,7 +19,14 @@ from torch import nn
 
 from torchspline.groups.group import Group
 from torchspline.io.archive import read_arrays, write_arrays
-from torchspline.splines import BSpline, HermiteSpline, KeyframeSpline, NonuniformBSpline, SplitBSpline, Trajectory
+from torchspline.splines import (
+    BSpline,
+    HermiteSpline,
+    KeyframeSpline,
+    NonuniformBSpline,
+    SplitBSpline,
+    Trajectory,
+)
 from torchspline.splines.trajectory import Mounted
 
 _FORMAT, _VERSION = "torchspline trajectory", 1
@@ -83,10 +90,10 @@ def load_trajectory(path: str | PathLike[str]) -> Trajectory:
     path = _path(path)
     arrays = read_arrays(path)
     try:
-        text = arrays.pop("header", None)
-        if text is None or text.dtype != np.uint8 or text.ndim != 1:
+        stored = arrays.pop("header", None)
+        if stored is None or stored.dtype != np.uint8 or stored.ndim != 1:
             raise ValueError(f"no header of a {_FORMAT}, only {', '.join(arrays)[:80] or 'nothing'}")
-        header = json.loads(text.tobytes().decode("utf-8"))
+        header = json.loads(stored.tobytes().decode("utf-8"))
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise ValueError(f"a header that does not say {_FORMAT!r}")
         if header.get("version") != _VERSION:
@@ -127,7 +134,9 @@ def _describe(trajectory: Any, arrays: dict[str, NDArray[Any]], prefix: str) -> 
     return header
 
 
-def _restore(header: Mapping[str, Any], arrays: dict[str, NDArray[Any]], prefix: str, depth: int) -> Trajectory:
+def _restore(
+    header: Mapping[str, Any], arrays: dict[str, NDArray[Any]], prefix: str, depth: int
+) -> Trajectory:
     name = header.get("family")
     family = FAMILIES.get(name) if isinstance(name, str) else None
     if family is None or depth > _DEEPEST:

@@ -6,7 +6,8 @@ themselves, and turns MJCF bodies about their origin wherever the joint is.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,6 +83,19 @@ def content(source: str | PathLike[str]) -> tuple[str, str]:
             f"source: expected XML text or the path of a file, got {str(path)!r}: no such file"
         )
     return str(path), path.read_text(encoding="utf-8", errors="replace")
+
+
+@contextmanager
+def naming(source: str | PathLike[str]) -> Iterator[None]:
+    """Errors in the block are of one line, and name the file that `source` is, if it is one."""
+    try:
+        yield
+    except ValueError as reason:
+        text = " ".join(str(reason).split())
+        is_text = isinstance(source, str) and source.lstrip().startswith("<")
+        if not is_text and str(source) not in text:
+            text = text.replace("source: ", f"source: {source}: ", 1)
+        raise ValueError(text) from None
 
 
 # ---------------------------------------------------------------------- URDF
