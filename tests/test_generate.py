@@ -180,7 +180,7 @@ def test_recipes_are_read_from_files(tmp_path):
         ("recipe: [", "expected YAML"),
     ):
         path.write_text(text)
-        with pytest.raises((TypeError, ValueError), match=f"bad.yaml: {message}"):
+        with pytest.raises((TypeError, ValueError), match=rf"bad.yaml(, line \d+)?: {message}"):
             Recipe.load(path)
     with pytest.raises(FileNotFoundError):
         Recipe.load(tmp_path / "absent.yaml")

@@ -125,7 +125,19 @@ def test_decimal_seconds_become_exact_nanoseconds(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["nan", "inf", "-inf", "", "1_0", "1.2.3", "0x10", "1e999999", "9223372036.854775808"]
+    "text",
+    [
+        "nan",
+        "inf",
+        "-inf",
+        "",
+        "1_0",
+        "1.2.3",
+        "0x10",
+        "1e999999",
+        "1e99999999999999999999",
+        "9223372036.854775808",
+    ],
 )
 def test_times_that_are_no_time(text):
     with pytest.raises(ValueError):

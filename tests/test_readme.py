@@ -8,10 +8,11 @@ import torch
 README = Path(__file__).resolve().parent.parent / "README.md"
 
 
-def test_readme_code_runs() -> None:
+def test_readme_code_runs(tmp_path, monkeypatch) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     torch.manual_seed(0)
+    monkeypatch.chdir(tmp_path)  # where it writes files
     names: dict = {}
     for code in blocks:  # each goes on where the one before ended
         exec(code, names)

@@ -1,9 +1,6 @@
 """Reading a recording: corners from npz archives, IMU samples from csv files, the rest from one YAML file."""
 
-import io
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -17,11 +14,11 @@ from torchspline import checks
 from torchspline.calibrate.recording import Corners, Recording
 from torchspline.imu.parameters import ImuNoise
 from torchspline.io import read_imu
+from torchspline.io.archive import read_arrays
 from torchspline.io.camera import camera_from
 from torchspline.io.sections import number, numbered, read_sections, section_of
+from torchspline.io.yaml import short
 
-#: Larger arrays are no recordings of a calibration, whatever their headers promise (bytes).
-_LARGEST = 2**30
 #: Columns of an archive: name there, name here, whole numbers, dimensions.
 _COLUMNS = (
     ("t_ns", "t_ns", True, 1),
@@ -99,49 +96,14 @@ def read_corners(path: Path_) -> Corners:
 
 
 def _archive(path: Path) -> dict[str, NDArray[Any]]:
-    if path.is_dir():
-        raise ValueError(f"{path}: expected a file, got a folder")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            inside = {info.filename: info for info in archive.infolist()}
-            columns = {}
-            for stored, name, whole, dimensions in _COLUMNS:
-                info = inside.get(f"{stored}.npy")
-                if info is None:
-                    names = ", ".join(x.removesuffix(".npy") for x in inside)
-                    raise ValueError(
-                        f"{path}: {stored}: expected this array in the archive, got only {names}"
-                    )
-                array = _array(path, archive, info, stored)
-                columns[name] = _converted(path, stored, array, whole, dimensions)
-            return columns
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as reason:
-        raise ValueError(
-            f"{path}: expected an npz archive of corners, got a damaged or truncated file ({reason})"
-        ) from None
-
-
-def _array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> NDArray[Any]:
-    """One array; its header is believed only where it agrees with the size of what is stored."""
-    if info.file_size > _LARGEST:
-        raise ValueError(f"{path}: {name}: expected at most {_LARGEST} bytes, got {info.file_size}")
-    file = io.BytesIO(archive.read(info))  # the whole of it: only then is its checksum looked at
-    try:
-        version = np.lib.format.read_magic(file)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        shape, _, dtype = read[version](file)
-    except (ValueError, KeyError) as reason:
-        raise ValueError(f"{path}: {name}: expected an array of NumPy, got damaged data ({reason})") from None
-    promised = file.tell() + math.prod(shape) * dtype.itemsize
-    if dtype.hasobject or promised != info.file_size:
-        raise ValueError(
-            f"{path}: {name}: expected an array of plain numbers, got {dtype} of shape {shape} "
-            f"in {info.file_size} bytes"
-        )
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
+    arrays, columns = read_arrays(path), {}
+    for stored, name, whole, dimensions in _COLUMNS:
+        if stored not in arrays:
+            raise ValueError(
+                f"{path}: {stored}: expected this array in the archive, got only {short(', '.join(arrays))}"
+            )
+        columns[name] = _converted(path, stored, arrays[stored], whole, dimensions)
+    return columns
 
 
 def _converted(path: Path, name: str, x: NDArray[Any], whole: bool, dimensions: int) -> NDArray[Any]:
@@ -201,6 +163,9 @@ def _check_board(path: Path, target: Any, corners: Corners) -> None:
     if missing:
         raise ValueError(f"{path}: calib_target: {missing[0]}: expected a number, got none")
     rows, columns, size, spacing = (number(f"{path}: calib_target: {x}", target[x]) for x in names)
+    for name, given in zip(names, (rows, columns, size, spacing), strict=True):
+        if not (math.isfinite(given) and given >= (1 if name in names[:2] else 0)):
+            raise ValueError(f"{path}: calib_target: {name}: expected the size of a board, got {given:g}")
     if len(corners) == 0:
         return
     stray = (corners.tag_id < 0) | (corners.tag_id >= rows * columns)

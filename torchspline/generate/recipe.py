@@ -11,6 +11,7 @@ from torchspline.generate.distributions import Distribution, distribution_of, nu
 from torchspline.generate.motions import MOTIONS
 from torchspline.generate.sensors import SENSOR_PARAMETERS
 from torchspline.generate.trajectories import MOUNTINGS, REST, Mounting, motion_distributions
+from torchspline.io.yaml import read_yaml, short
 
 
 @dataclass(frozen=True)
@@ -113,15 +114,11 @@ class Recipe:
         Raises:
             FileNotFoundError: no such file. TypeError, ValueError: with the file and the key.
         """
-        import yaml
-
         path = Path(path)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ValueError(f"{path}: expected YAML, got {' '.join(str(error).split())}") from None
-        if not isinstance(content, Mapping) or "recipe" not in content:
-            raise ValueError(f"{path}: expected a key `recipe` that holds motions and sensor")
+        names = "a key `recipe` that holds motions and sensor"
+        content = read_yaml(path, names)
+        if "recipe" not in content:
+            raise ValueError(f"{path}: expected {names}")
         given = content["recipe"]
         try:
             given = _mapping("recipe", given, cls.__dataclass_fields__)
@@ -129,7 +126,8 @@ class Recipe:
                 raise ValueError("recipe.motions: expected kinds of motion, got none")
             return cls(**given)
         except (TypeError, ValueError) as error:
-            raise type(error)(f"{path}: {error}") from None
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"{path}: {short(error, 500)}") from None
 
 
 def _plain(value: Any) -> Any:

@@ -18,6 +18,7 @@ from torchspline import checks
 from torchspline.generate.blocks import Column, compute_block, items_per_block, rows
 from torchspline.generate.processes import rank_and_world
 from torchspline.generate.recipe import Recipe
+from torchspline.io.yaml import short
 from torchspline.kernels import mode
 from torchspline.kernels.build import available
 
@@ -118,11 +119,10 @@ class ShardedDataset(Dataset):
         folder = _path(folder)
         if not (folder / MANIFEST).is_file():
             raise FileNotFoundError(f"folder: expected {MANIFEST} in it, found none in {folder}")
-        self.manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        self.manifest: dict[str, Any] = _read_manifest(folder / MANIFEST)
         if self.manifest.get("format") != FORMAT:
-            raise ValueError(
-                f"folder: expected a data set of format {FORMAT!r} in {folder}, got {self.manifest.get('format')!r}"
-            )
+            got = short(repr(self.manifest.get("format")))
+            raise ValueError(f"folder: expected a data set of format {FORMAT!r} in {folder}, got {got}")
         numbers = range(self.manifest["shards"])
         self.files = [folder / shard_name(shard) for shard in numbers]
         missing = [path.name for path in self.files if not path.is_file()]
@@ -159,8 +159,8 @@ class ShardedDataset(Dataset):
                 first, group = first + size, group + 1
             try:
                 table = file.read_row_group(group)
-            except OSError as error:
-                raise ValueError(f"folder: {self.files[shard]} is damaged: {error}") from None
+            except (OSError, pyarrow().ArrowException) as error:
+                raise ValueError(f"folder: {self.files[shard]} is damaged: {short(error)}") from None
         return first, first + size, {name: _column(table[name]) for name in table.column_names}
 
 
@@ -213,10 +213,26 @@ def _text(manifest: dict[str, Any]) -> str:
     return json.dumps(manifest, indent=2) + "\n"
 
 
+def _read_manifest(path: Path) -> dict[str, Any]:
+    """What `_text` wrote, of a size that agrees with itself."""
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(manifest, dict):
+            raise ValueError(f"expected an object, got {type(manifest).__name__}")
+        if manifest.get("format") == FORMAT:
+            for name in ("items", "items_per_shard", "shards"):
+                checks.whole(name, manifest.get(name), least=1)  # type: ignore[arg-type]
+            if manifest["shards"] != -(-manifest["items"] // manifest["items_per_shard"]):
+                raise ValueError(f"shards: expected as many as items need, got {manifest['shards']}")
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"folder: {path} is damaged: {short(error)}") from None
+    return manifest
+
+
 def _agree(folder: Path, manifest: dict[str, Any]) -> None:
     if not (folder / MANIFEST).exists():
         return
-    there = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    there = _read_manifest(folder / MANIFEST)
     different = [name for name in manifest | there if manifest.get(name) != there.get(name)]
     if different:
         name = different[0]
@@ -283,7 +299,8 @@ def _array(x: Column) -> Any:
     numbers = x.contiguous().numpy()
     if numbers.ndim == 1:
         return library.array(numbers)
-    return library.FixedShapeTensorArray.from_numpy_ndarray(numbers)
+    # The strides of a single item may be anything, in which Arrow finds fault: those of a flat array are not.
+    return library.FixedShapeTensorArray.from_numpy_ndarray(numbers.reshape(-1).reshape(numbers.shape))
 
 
 def _column(x: Any) -> Column:

@@ -1,7 +1,9 @@
 """Reading and writing recordings: `read_poses`, `read_imu`, `read_bvh`, `write_poses`, `write_imu`; and what
 calibration finds: `read_imu_parameters`, `read_camchain` and their writers.
 
-To add a format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
+Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`.
+Bags of ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends
+with its `FORMAT` and name the module in `_FORMATS` below.
 """
 
 from os import PathLike
@@ -9,14 +11,17 @@ from pathlib import Path
 
 import torch
 
-from torchspline.io import euroc, kitti, tum
+from torchspline.io import euroc, kitti, ros, tum
 from torchspline.io.bvh import Skeleton, read_bvh
 from torchspline.io.camchain import CamChain, read_camchain, write_camchain
 from torchspline.io.camera import Camera
 from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, write_imu_parameters
+from torchspline.io.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
+from torchspline.io.ros import write_rosbag
 from torchspline.io.text import Table, read_table
+from torchspline.io.trajectory import load_trajectory, save_trajectory
 
 __all__ = [
     "CamChain",
@@ -25,36 +30,49 @@ __all__ = [
     "ImuRecord",
     "PoseRecord",
     "Skeleton",
+    "load_trajectory",
     "read_bvh",
     "read_camchain",
     "read_imu",
     "read_imu_parameters",
+    "read_nerfstudio",
     "read_poses",
+    "save_trajectory",
     "write_camchain",
     "write_imu",
     "write_imu_parameters",
+    "write_nerfstudio",
     "write_poses",
+    "write_rosbag",
 ]
 
 _FORMATS: dict[str, Format] = {module.FORMAT.name: module.FORMAT for module in (euroc, kitti, tum)}
 
 
 def read_poses(
-    path: str | PathLike[str], format: str | None = None, times: str | PathLike[str] | None = None
+    path: str | PathLike[str],
+    format: str | None = None,
+    times: str | PathLike[str] | None = None,
+    topic: str | None = None,
 ) -> PoseRecord:
     """Read stamped poses, body to world: metres, quaternions [w, x, y, z], exact nanoseconds.
 
     Args:
         path: a file, plain or gzipped, or an EuRoC folder (the one of `data.csv`, or of the whole sequence,
-            where `state_groundtruth_estimate0` goes before `mocap0`).
-        format: "euroc", "kitti" or "tum"; found from the content when not given.
+            where `state_groundtruth_estimate0` goes before `mocap0`), or a ROS bag (.bag, .mcap, .db3, or the folder of
+            a bag).
+        format: "euroc", "kitti", "ros" or "tum"; found from the content when not given.
         times: the file of stamps, for KITTI only; looked for beside the poses when not given.
+        topic: of a ROS bag, with PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry messages; the
+            only one there is when not given. Messages are stamped by their headers.
     Returns:
         PoseRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
     Raises:
         FileNotFoundError: no such file, or no file of stamps.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
+    if _is_bag(path, format, topic):
+        return ros.read_poses(_path(path), topic)
     table, chosen = _open(_path(path), format, "read_poses", "pose_files")
     assert chosen.read_poses
     if times is not None and not chosen.separate_times:
@@ -62,18 +80,21 @@ def read_poses(
     return chosen.read_poses(table, None if times is None else Path(times))
 
 
-def read_imu(path: str | PathLike[str], format: str | None = None) -> ImuRecord:
+def read_imu(path: str | PathLike[str], format: str | None = None, topic: str | None = None) -> ImuRecord:
     """Read stamped IMU samples: rad/s, specific force in m/s^2, exact nanoseconds.
 
     Args:
-        path: a file, plain or gzipped, or an EuRoC folder (the one of `data.csv`, or of the whole sequence).
-        format: "euroc"; found from the content when not given.
+        path: a file, plain or gzipped, an EuRoC folder (the one of `data.csv`, or of the whole sequence), or a ROS bag.
+        format: "euroc" or "ros"; found from the content when not given.
+        topic: of a ROS bag, with sensor_msgs/Imu messages; the only one there is when not given.
     Returns:
         ImuRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
     Raises:
         FileNotFoundError: no such file.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
+    if _is_bag(path, format, topic):
+        return ros.read_imu(_path(path), topic)
     table, chosen = _open(_path(path), format, "read_imu", "imu_files")
     assert chosen.read_imu
     return chosen.read_imu(table)
@@ -105,6 +126,14 @@ def write_imu(path: str | PathLike[str], record: ImuRecord, format: str = "euroc
         ValueError: a format that is unknown or cannot be written, a record without rows.
     """
     _write(path, record, ImuRecord, format, "write_imu")
+
+
+def _is_bag(path: str | PathLike[str], format: str | None, topic: str | None) -> bool:
+    """Whether a ROS bag is meant; topics are for those alone."""
+    bag = format == ros.NAME or (format is None and ros.is_bag(_path(path)))
+    if topic is not None and not bag:
+        raise ValueError(f"topic: expected none, since {path} is no ROS bag, got {topic!r}")
+    return bag
 
 
 def _formats(action: str, name: str | None) -> list[Format]:

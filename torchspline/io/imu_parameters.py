@@ -15,6 +15,7 @@ from torchspline import checks
 from torchspline.groups.convert import from_rotation_matrix, from_transform_matrix, to_transform_matrix
 from torchspline.groups.group import SE3, SO3
 from torchspline.imu.parameters import ImuNoise
+from torchspline.io.yaml import read_yaml, short
 
 _DENSITIES = (
     "accelerometer_noise_density",
@@ -73,7 +74,7 @@ def read_imu_parameters(path: str | PathLike[str], inflation: float = 1.0) -> Im
     """
     path = _path(path)
     checks.positive("inflation", inflation)
-    content = _load(path)
+    content: dict[str, Any] = read_yaml(path, f"keys such as {_DENSITIES[0]}")
     if len(content) >= 1 and all(
         isinstance(x, dict) and str(k).startswith("imu") for k, x in content.items()
     ):
@@ -93,7 +94,7 @@ def read_imu_parameters(path: str | PathLike[str], inflation: float = 1.0) -> Im
         pose = SE3.inverse(_transform(path, "T_i_b", _matrix(path, "T_i_b", content["T_i_b"], 4)))
     topic = content.get("rostopic")
     if topic is not None and not isinstance(topic, str):
-        raise ValueError(f"{path}: key rostopic: expected text, got {topic!r}")
+        raise ValueError(f"{path}: key rostopic: expected text, got {short(repr(topic))}")
     return ImuParameters(ImuNoise(**densities), rate, pose, topic, _calibration(path, content))
 
 
@@ -174,35 +175,10 @@ def _path(path: str | PathLike[str]) -> Path:
     return Path(path)
 
 
-def _load(path: Path) -> dict[str, Any]:
-    yaml = importlib.import_module("yaml")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: expected a file, there is none") from None
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: expected a YAML file, got bytes that are no text: {error}") from None
-    except IsADirectoryError:
-        raise ValueError(f"{path}: expected a file, got a folder") from None
-    if text.startswith("%YAML:"):  # OpenCV writes a directive that YAML does not know
-        text = text.partition("\n")[2]
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        where = getattr(error, "problem_mark", None)
-        line = f", line {where.line + 1}" if where else ""
-        raise ValueError(
-            f"{path}{line}: expected YAML, got {getattr(error, 'problem', None) or error}"
-        ) from None
-    if not isinstance(content, dict) or not content:
-        raise ValueError(f"{path}: expected keys such as {_DENSITIES[0]}, got {type(content).__name__}")
-    return content
-
-
 def _finite(path: Path, content: Mapping[str, Any], key: str) -> float:
     if key not in content:
         raise ValueError(
-            f"{path}: key {key} is missing; expected a number; there are {', '.join(map(str, content))}"
+            f"{path}: key {key} is missing; expected a number; there are {short(', '.join(map(str, content)))}"
         )
     x = content[key]
     try:
@@ -210,7 +186,7 @@ def _finite(path: Path, content: Mapping[str, Any], key: str) -> float:
             raise TypeError
         value = float(x)  # YAML 1.1 takes 1e-3 for text
     except (TypeError, ValueError):
-        raise ValueError(f"{path}: key {key}: expected a number, got {x!r}") from None
+        raise ValueError(f"{path}: key {key}: expected a number, got {short(repr(x))}") from None
     if not math.isfinite(value):
         raise ValueError(f"{path}: key {key}: expected a finite number, got {value}")
     return value
@@ -227,7 +203,7 @@ def _number(path: Path, content: Mapping[str, Any], key: str, zero_too: bool = F
 def _matrix_of(path: Path, x: Any) -> Tensor:
     """OpenCV's way: {cols, rows, data}."""
     if not isinstance(x, dict) or "data" not in x:
-        raise ValueError(f"{path}: key T_BS: expected cols, rows and data, got {x!r}")
+        raise ValueError(f"{path}: key T_BS: expected cols, rows and data, got {short(repr(x))}")
     data = x["data"]
     if isinstance(data, list) and len(data) == 16 and not any(isinstance(y, list) for y in data):
         data = [data[i : i + 4] for i in range(0, 16, 4)]
@@ -240,7 +216,7 @@ def _matrix(path: Path, key: str, x: Any, size: int) -> Tensor:
     except (TypeError, ValueError):
         rows = []
     if len(rows) != size or any(len(row) != size for row in rows):
-        raise ValueError(f"{path}: key {key}: expected {size} x {size} numbers, got {x!r}")
+        raise ValueError(f"{path}: key {key}: expected {size} x {size} numbers, got {short(repr(x))}")
     matrix = torch.tensor(rows, dtype=torch.float64)
     if not matrix.isfinite().all():
         raise ValueError(f"{path}: key {key}: expected finite numbers, got {rows}")
@@ -273,7 +249,7 @@ def _calibration(path: Path, content: Mapping[str, Any]) -> dict[str, Tensor]:
         if given is None:
             continue
         if not isinstance(given, dict):
-            raise ValueError(f"{path}: key {sensor}s: expected matrices by name, got {given!r}")
+            raise ValueError(f"{path}: key {sensor}s: expected matrices by name, got {short(repr(given))}")
         for name, x in given.items():
             key = f"{sensor}s.{name}"
             if name == "M":

@@ -5,8 +5,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-#: Larger files are no settings (bytes).
-_LARGEST = 2**20
+from torchspline.io.yaml import read_yaml, short
 
 
 def read_sections(path: str | PathLike[str]) -> dict[str, Any]:
@@ -16,24 +15,9 @@ def read_sections(path: str | PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: no such file.
         ValueError: no YAML, or no names at its top level.
     """
-    import yaml
-
     if not isinstance(path, (str, PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path}: expected a file, got a folder")
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise ValueError(f"{path}: expected at most {_LARGEST} bytes, got {path.stat().st_size}")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as reason:
-        raise ValueError(f"{path}: expected a YAML file, got {' '.join(str(reason).split())}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected sections such as cam0 and imu0, got {type(content).__name__}")
-    return content
+    return read_yaml(Path(path), "sections such as cam0 and imu0")
 
 
 def numbered(content: Mapping[str, Any], kind: str) -> list[str]:
@@ -65,4 +49,4 @@ def number(name: str, x: Any) -> float:
             raise ValueError
         return float(x)
     except ValueError:
-        raise ValueError(f"{name}: expected a number, got {x!r}") from None
+        raise ValueError(f"{name}: expected a number, got {short(repr(x))}") from None

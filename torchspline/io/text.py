@@ -1,8 +1,8 @@
 """Tables of numbers in text files: reading with errors that name the line, exact stamps, writing."""
 
 import gzip
+import io
 import re
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from torchspline.io.archive import read_bytes
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -32,7 +34,10 @@ def parse_seconds(field: str) -> int:
     """
     if not _DECIMAL.fullmatch(field):
         raise ValueError("a finite number of seconds")
-    seconds = Decimal(field)
+    try:
+        seconds = Decimal(field)
+    except ArithmeticError:  # an exponent of twenty digits
+        return _checked(_INT64.stop)
     if seconds and seconds.adjusted() > 10:  # before an exponent such as 1e999999 becomes an integer
         return _checked(_INT64.stop)
     return _checked(int(seconds.scaleb(9, _EXACT).to_integral_value(ROUND_HALF_EVEN)))
@@ -88,6 +93,7 @@ class Table:
 
     def error(self, row: int, got: str, expected: str) -> ValueError:
         """A `ValueError` that names the file, the line, what came and what was expected."""
+        got = got if len(got) <= 120 else f"{got[:117]}..."
         return ValueError(f"{self.path}, line {self.lines[row]}: expected {expected}, got {got}")
 
     def excerpt(self, row: int) -> str:
@@ -146,12 +152,13 @@ def read_table(path: Path) -> Table:
         FileNotFoundError: no such file.
         ValueError: damaged gzip, or a file without any row.
     """
-    text = _read_text(path).replace("\r\n", "\n").replace("\r", "\n")
+    # Bytes that are no text become fields that are no numbers, and those are reported with their line.
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
     head: list[str] = []
     lines: list[int] = []
     rows: list[list[str]] = []
     header = commas = False
-    for number, line in enumerate(text.split("\n"), 1):
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):  # a line in memory at a time
         line = line.strip()
         if not line:
             continue
@@ -183,22 +190,6 @@ def write_table(
     rows = (separator.join([t, *map(repr, row)]) for t, row in zip(stamps, values.tolist(), strict=True))
     content = "\n".join([head, *rows, ""]).encode()
     path.write_bytes(gzip.compress(content, compresslevel=6, mtime=0) if path.suffix == ".gz" else content)
-
-
-def _read_text(path: Path) -> str:
-    if path.is_dir():
-        raise ValueError(f"{path}: expected a file, got a folder")
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    if content.startswith(b"\x1f\x8b"):
-        try:
-            content = gzip.decompress(content)
-        except (OSError, EOFError, zlib.error) as reason:
-            raise ValueError(f"{path}: expected gzipped text, got damaged data ({reason})") from None
-    # Bytes that are no text become fields that are no numbers, and those are reported with their line.
-    return content.decode("utf-8-sig", errors="replace")
 
 
 def _is_number(field: str) -> bool:

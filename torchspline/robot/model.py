@@ -74,7 +74,8 @@ class Robot:
         Raises:
             FileNotFoundError, TypeError, ValueError: no such file, or no robot that is a tree of such joints.
         """
-        return cls(*readers.from_urdf(source))
+        with readers.naming(source):
+            return cls(*readers.from_urdf(source))
 
     @classmethod
     def from_mjcf(cls, source: str | PathLike[str]) -> "Robot":
@@ -85,7 +86,8 @@ class Robot:
         Raises:
             ImportError: MuJoCo is not installed. FileNotFoundError, TypeError, ValueError: as for `from_urdf`.
         """
-        return cls(*readers.from_mjcf(source))
+        with readers.naming(source):
+            return cls(*readers.from_mjcf(source))
 
     @classmethod
     def from_chain(cls, chain: Any) -> "Robot":

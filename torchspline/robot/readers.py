@@ -7,7 +7,8 @@ themselves, and turns MJCF bodies about their origin wherever the joint is.
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -89,6 +90,19 @@ def content(source: str | PathLike[str]) -> tuple[str, bytes]:
             f"source: expected XML text or the path of a file, got {came!r}: no such file"
         )
     return str(path), path.read_bytes()
+
+
+@contextmanager
+def naming(source: str | PathLike[str]) -> Iterator[None]:
+    """Errors in the block are of one line, and name the file that `source` is, if it is one."""
+    try:
+        yield
+    except ValueError as reason:
+        text = " ".join(str(reason).split())
+        is_text = isinstance(source, str) and source.lstrip().startswith("<")
+        if not is_text and str(source) not in text:
+            text = text.replace("source: ", f"source: {source}: ", 1)
+        raise ValueError(text) from None
 
 
 # ---------------------------------------------------------------------- URDF
