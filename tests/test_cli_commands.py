@@ -209,6 +209,14 @@ def test_fit_gives_back_the_spline(places, tmp_path):
     assert torchspline("fit", places["saved"], "--out", places["saved"]).returncode == 2
 
 
+def test_results_are_named_after_the_data_and_go_into_this_folder(places, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command, name in (("fit", "poses.npz"), ("view", "poses.html")):
+        done = torchspline(command, places["poses"], "--spacing", "500", "--order", "4", "--json")
+        assert json.loads(done.stdout)["files"] == [name]
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["poses.html", "poses.npz"]
+
+
 def test_convert_keeps_every_number(places, tmp_path):
     original = read_poses(places["poses"])
     for chain in (("a.csv", "b.txt"), ("a.txt.gz", "b.csv.gz")):

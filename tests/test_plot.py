@@ -172,6 +172,20 @@ def test_covariance_tube(spline):
     assert len(space.collections) == 1
 
 
+def test_covariance_tube_of_a_solution():
+    """Poses of known noise: what the figure shows at the times of the poses is what `Result` says."""
+    t = torch.linspace(1.0, 4.0, 60, dtype=torch.float64)
+    spline = SplitBSpline(POINTS, order=4, dt=0.5, t0=1.0)
+    problem = fit.Problem(spline)
+    problem.add(fit.Pose(t, SPLIT(((t - 1.0) * 1e9).round().long() + 10), sigma=0.01))
+    covariance = problem.solve(progress=False).trajectory_covariance(t)
+    figure = plot.covariance_tube(spline, t, covariance)
+    shown = figure.axes[1].lines[2].get_ydata()
+    np.testing.assert_allclose(shown, 1e3 * covariance[:, 2, 2].sqrt())
+    assert shown.min() > 1.0
+    assert shown.max() < 10.0
+
+
 def test_imu_comparison():
     reading = imu.measure(JOINT, T)
     dots = imu.ImuReading(reading.gyroscope[::3] + 1.0, reading.accelerometer[::3])

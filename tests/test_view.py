@@ -120,6 +120,10 @@ def test_in_a_browser(tmp_path):
         )
         browser.value(f"(() => {{ {seek} }})()")
         browser.wait("document.getElementById('clock').textContent === '1.500 s'")
+        browser.value("document.getElementById('play').click()")
+        browser.wait("now > 1.6")
+        browser.value("document.getElementById('play').click()")
+        assert browser.value("playing") is False
         browser.value("document.querySelectorAll('#legend input')[1].click()")
         browser.wait("!document.getElementById('readout').textContent.includes('split')")
         assert "joint" in readings()

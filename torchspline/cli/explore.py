@@ -3,6 +3,7 @@
 import sys
 import time
 from pathlib import Path
+from typing import Literal
 
 from torchspline.cli.report import Report
 from torchspline.explore import METHODS, Explorer
@@ -19,6 +20,8 @@ def explore(
     file: Path | None = None,
     keyframes: int = 8,
     methods: list[str] | None = None,
+    format: Literal["tum", "euroc", "kitti", "ros"] | None = None,
+    times: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open: bool = False,
@@ -33,6 +36,8 @@ def explore(
         file: poses or a saved trajectory (.npz) to take keyframes from.
         keyframes: how many of them.
         methods: shown at the start; names of interpolate, or "squad on SE3".
+        format: of the poses; by default recognised from their content.
+        times: file of times that goes with KITTI poses.
         host: where to listen; 127.0.0.1 is this machine alone.
         port: where to listen; the next free one if it is taken.
         open: show the page in the browser.
@@ -42,7 +47,9 @@ def explore(
     chosen = ["SPLIT", "SPLIT SQUAD", "SPLIT CuBsp"] if methods is None else methods
     names = {name.lower(): name for name in METHODS}
     chosen = [names.get(name.lower(), name) for name in chosen]
-    explorer = Explorer(methods=chosen) if file is None else Explorer.load(file, keyframes, chosen)
+    explorer = (
+        Explorer(methods=chosen) if file is None else Explorer.load(file, keyframes, chosen, format, times)
+    )
     if figure is not None:
         explorer.figure().savefig(figure, dpi=150)
         _, wrong = explorer.curves()

@@ -19,6 +19,11 @@ def is_trajectory(path: Path) -> bool:
     return path.suffix == ".npz" or (path.is_file() and zipfile.is_zipfile(path))
 
 
+def named_after(path: Path, suffix: str) -> Path:
+    """The default name of what is made of a file: in the working folder, since that of data may not be ours."""
+    return Path(path.resolve().name.removesuffix(".gz").rsplit(".", 1)[0] + suffix)
+
+
 def open_poses(
     path: Path, format: PoseFormat | None = None, times: Path | None = None, topic: str | None = None
 ) -> PoseRecord:

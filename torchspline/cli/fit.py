@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchspline.cli.common import NS, fit_report, fit_rows
-from torchspline.cli.files import PoseFormat, fitted, open_poses
+from torchspline.cli.files import PoseFormat, fitted, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import save_trajectory
 
@@ -34,7 +34,7 @@ def fit(
 
     Args:
         poses: TUM, EuRoC, KITTI or nerfstudio file, gzipped or not, or ROS bag.
-        out: trajectory file, for torchspline.io.load_trajectory; by default beside the poses, with suffix .npz.
+        out: trajectory file, for torchspline.io.load_trajectory; by default named after the poses, in this folder.
         spacing: of the knots, ms; auto finds one from the data and says why.
         order: of the spline; the curve has order - 2 continuous derivatives.
         representation: split (R3 x SO3) or joint (SE3).
@@ -49,7 +49,7 @@ def fit(
     """
     record = open_poses(poses, format, times, topic)
     used, found = fitted(record, spacing, order, representation, gap, start, duration)
-    target = out or poses.with_name(f"{poses.name.removesuffix('.gz').rsplit('.', 1)[0]}.npz")
+    target = out or named_after(poses, ".npz")
     if target.resolve() == poses.resolve():
         raise ValueError(f"out: expected another file than the poses, got {target}")
     save_trajectory(target, found.trajectory)

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 
 from torchspline.cli.common import NS
-from torchspline.cli.files import PoseFormat, fitted, is_trajectory, open_poses
+from torchspline.cli.files import PoseFormat, fitted, is_trajectory, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import load_trajectory
 from torchspline.splines import Trajectory
@@ -41,7 +41,7 @@ def view(
 
     Args:
         file: poses (TUM, EuRoC, KITTI, nerfstudio), a ROS bag, or a saved trajectory.
-        out: the page; by default beside the file, with suffix .html.
+        out: the page; by default named after the file, in this folder.
         open: show it in the browser.
         spacing: of the knots of the spline through poses, ms; auto finds one from the data.
         order: of that spline.
@@ -63,7 +63,7 @@ def view(
             open_poses(file, format, times, topic), spacing, order, "split", gap, start, duration
         )
         trajectory, measured, notes = fit.trajectory, used.position, fit.notes
-    target = out or file.with_name(f"{file.name.removesuffix('.gz').rsplit('.', 1)[0]}.html")
+    target = out or named_after(file, ".html")
     write_page(target, trajectory, measured=measured, samples=samples, up=up, title=file.name)
     if open:
         import webbrowser
