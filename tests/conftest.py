@@ -5,12 +5,16 @@ compiling a kernel for every group, order and precision they touch would take mo
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from contract import Recorder
 
 os.environ.setdefault("TORCHSPLINE_KERNELS", "reference")
+
+RECORDER = pytest.StashKey[Recorder]()
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
@@ -24,3 +28,25 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings not found at {folder}; point TORCHSPLINE_DATA to them")
     return folder
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """`TORCHSPLINE_CONTRACT` names a folder for what the tests show of the gradient contract."""
+    folder = os.environ.get("TORCHSPLINE_CONTRACT")
+    if folder:
+        config.stash[RECORDER] = Recorder(Path(folder))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Iterator[None]:
+    outcome = yield
+    report = outcome.get_result()
+    if report.when == "call" and not report.skipped and RECORDER in item.config.stash:
+        item.config.stash[RECORDER].note(item, report.passed)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Of several processes each worker writes its own file; the one that hands out the tests has none to write."""
+    recorder = session.config.stash.get(RECORDER, None)
+    if recorder is not None and (recorder.kept or recorder.broken):
+        recorder.write()

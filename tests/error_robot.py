@@ -127,6 +127,7 @@ def sources() -> Iterator[Case]:
     yield refused(function, "source", "type", 5, "got int", "XML text or the path of a file")
     yield refused(function, "source", "option", missing, "no such file", "XML text or the path of a file")
     yield refused(function, "source", "option", "<nonsense", "cannot be read", "in source")
+    yield refused(function, "source", "option", "", "got ''", "XML text or the path of a file")
     empty = URDF[: URDF.index("<link")] + '<link name="a"/></robot>'
     for bad, came, expected in (
         (empty, "got one without", "joints that move"),
@@ -143,6 +144,17 @@ def sources() -> Iterator[Case]:
             "mimics",
             "another joint that moves",
         ),
+        (
+            URDF.replace('<link name="arm"/>', '<link name="arm"/><link name="arm"/>'),
+            "two called 'arm'",
+            "links of different names",
+        ),
+        (URDF.replace('lower="-1.5"', 'lower="nan"'), "'pan' has limits from nan to 1.5", "lower <= upper"),
+        (URDF.replace('lower="-1.5"', 'lower="2"'), "'pan' has limits from 2.0 to 1.5", "lower <= upper"),
+        (URDF.replace('velocity="2"', 'velocity="nan"'), "velocity and effort [nan, 30.0]", "at least zero"),
+        (URDF.replace('xyz="0.2 0.1 2"', 'xyz="0 inf 2"'), "'pan' has the axis", "a direction"),
+        (URDF.replace('xyz="0 0 0.123456789012345"', 'xyz="0 nan 0"'), "'pan' has an origin", "numbers"),
+        (URDF.replace('multiplier="-2"', 'multiplier="inf"'), "'follow' mimics with factor inf", "finite"),
         (
             URDF.replace('<child link="tip"/>', '<child link="arm"/>'),
             "'arm' has two parents",

@@ -192,5 +192,41 @@ def test_batches_and_ranges():
 def test_figure(tmp_path):
     x = simulated(3000, 2, white_noise=0.01, random_walk=0.01)
     found = allan_deviation(x, stamps(3000))
-    plot.allan(tmp_path / "a.png", {"made": found}, {"made": fit_noise(found)}, "rad/s", "noise")
+    figure = plot.allan({"made": found}, {"made": fit_noise(found)}, "rad/s", "noise")
+    figure.savefig(tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
+def test_default_clusters_are_those_that_fit_between_gaps():
+    """Unless sizes are asked for, in which case the first that does not fit is named."""
+    x, t = simulated(600, 2, white_noise=0.01), stamps(600)
+    x[[200, 400], 1] = math.nan
+    found = allan_deviation(x, t)
+    assert 60 < found.clusters.max() <= 100  # two in the 200 samples before the first gap
+    assert found.deviation.isfinite().all()
+    for i, m in enumerate(found.clusters.tolist()):
+        assert found.deviation[i, 1].item() == pytest.approx(by_definition(x[:, 1].numpy(), m), rel=1e-9)
+    with pytest.raises(ValueError, match=r"clusters.*between gaps of the record, got 101 samples"):
+        allan_deviation(x, t, [1, 50, 100, 101])
+
+
+@pytest.mark.parametrize("record", ["constant", "below its resolution"])
+def test_deviations_of_zero_are_named(record):
+    x = simulated(500, 2, white_noise=0.001)
+    x[:, 1] = x[:, 1].round() if record == "below its resolution" else 3.0
+    with pytest.raises(
+        ValueError, match=r"allan: expected deviations above zero, got 0.0 over 0.01 s in channel 1"
+    ):
+        fit_noise(allan_deviation(x, stamps(500)))
+
+
+def test_a_gap_of_years_is_named_before_memory_is_taken():
+    t = stamps(100)
+    t[40:] += 1.5e9
+    with pytest.raises(ValueError, match=r"t: expected a record.*gap of 1.5e.09 s between samples 39 and 40"):
+        allan_deviation(simulated(100, 1, white_noise=0.01), t)
+
+
+def test_no_records():
+    found = fit_noise(allan_deviation(torch.zeros(0, 300, 2, dtype=F64), stamps(300)))
+    assert found.chi_square.shape == found.coefficient["white_noise"].shape == (0, 2)

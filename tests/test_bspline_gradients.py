@@ -33,6 +33,7 @@ each_order = pytest.mark.parametrize("order", ORDERS)
 # ---------------------------------------------------------------------- first derivatives
 
 
+@pytest.mark.contract(function="bspline", properties="forward finite")
 @each_group
 @each_order
 def test_forward_mode_is_the_transpose_of_reverse_mode(group, order):
@@ -66,6 +67,7 @@ def test_forward_mode_is_the_transpose_of_reverse_mode(group, order):
         assert (ahead.sum() - back).abs() <= 1e-9 * scale.sum()
 
 
+@pytest.mark.contract(function="bspline", arguments="control_points t", properties="first")
 @each_group
 @each_order
 def test_forward_mode_in_multi_precision(group, order):
@@ -106,6 +108,7 @@ def test_time_arguments_against_differences(group, order):
         assert close(ours, (ahead - behind) / (2 * h), 1e-8)
 
 
+@pytest.mark.contract(function="bspline", regimes="identity, small, general", properties="first second")
 @pytest.mark.parametrize(
     ("group", "order"), [*((g, (4, 4, 3, 3, 2, 7)[i % 6]) for i, g in enumerate(GROUPS)), (SO3, 2)], ids=str
 )
@@ -256,6 +259,11 @@ def test_length_and_sign_of_quaternions(group, dtype):
             assert close(mine, others, 1e3 * torch.finfo(dtype).eps)
 
 
+@pytest.mark.contract(
+    function="bspline", arguments="control_points t", regimes="identity, small, general", dtypes="float32",
+    properties="single",
+)  # fmt: skip
+@pytest.mark.contract(function="bspline", arguments="control_points t", dtypes="float32", properties="finite")
 @each_group
 @each_order
 def test_single_precision(group, order):

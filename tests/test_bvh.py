@@ -81,6 +81,7 @@ def test_poses_against_matrices(tmp_path):
         lambda s: s.replace("\n", "\r\n"),
         lambda s: s.replace("  ", "\t"),
         lambda s: "\ufeff" + s.replace("\n", "\n\n"),
+        lambda s: s.replace("End Site\n    {", "End Site {"),
         lambda s: s.replace("HIERARCHY", "Hierarchy").replace("Frame Time:", "frame time :"),
     ],
 )

@@ -15,11 +15,12 @@ import pytest
 import torch
 import yaml
 
-from torchspline import R3, SE3, SO3, BSpline
-from torchspline.calibrate import command, figures, find_start, write_calibration
+from torchspline import R3, SE3, SO3, BSpline, cli
+from torchspline.calibrate import figures, find_start, write_calibration
 from torchspline.calibrate.coverage import CELLS, coverage
 from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.simulate import Simulation, simulate
+from torchspline.cli.calibrate import rows
 from torchspline.fit import Result
 from torchspline.io import ImuRecord, read_camchain, write_imu
 
@@ -279,11 +280,15 @@ def test_the_command_calibrates(files, calibration):
     done = run(
         "--imu", files / "imu.csv", "--corners", files / "cam0.npz", files / "cam1.npz", "--config",
         files / "config.yaml", "--out", files / "out", "--spacing", "50", "--estimate-intrinsics", "--order=5",
+        "--json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "T_imu_cam1 position" in done.stdout
+    report = json.loads(done.stdout)
+    assert report["command"] == "calibrate camera-imu"
+    assert "T_imu_cam1 position" in [row[0] for row in rows(calibration)]
     assert sorted(x.name for x in (files / "out").iterdir()) == sorted(FILES)
     content = json.loads((files / "out" / "result.json").read_text())
+    assert report["T_imu_cam1"] == content["T_imu_cam1"]
     assert content["trajectory"]["spacing_s"] == 0.05
     assert len(content["intrinsics_cam1"]["sigma"]) == 8
     pose = torch.tensor(content["T_imu_cam1"]["translation"] + content["T_imu_cam1"]["quaternion"]).double()
@@ -306,10 +311,11 @@ def test_the_command_says_what_is_wrong(files):
         ("--duration=0.2", "expected at least 20 images"),
     ],
 )
-def test_the_command_refuses_options(files, option, words):
+def test_the_command_refuses_options(files, option, words, capsys):
     arguments = ["--imu", files / "imu.csv", "--corners", files / "cam0.npz", files / "cam1.npz"]
-    with pytest.raises(ValueError, match=words):
-        command.run([*map(str, arguments), "--config", str(files / "config.yaml"), option])
+    options = ["--config", files / "config.yaml", option]
+    assert cli.run(["calibrate", "camera-imu", *map(str, (*arguments, *options))]) == 2
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.realdata

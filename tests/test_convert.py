@@ -267,6 +267,7 @@ def test_every_function_is_tried():
     assert public == names | others
 
 
+@pytest.mark.contract(function="conversions", regimes="general", properties="first second")
 @EACH
 def test_gradients(function, make):
     check_gradients(function, make(2, seed=3))
@@ -304,6 +305,7 @@ def test_gradients_are_finite_everywhere(dtype):
         assert second.isfinite().all()
 
 
+@pytest.mark.contract(function="conversions", regimes="general", properties="vmap")
 @EACH
 @PRECISIONS
 def test_dtype_batch_and_vmap(function, make, dtype):
@@ -318,6 +320,7 @@ def test_dtype_batch_and_vmap(function, make, dtype):
     assert function(x[:0]).shape == y[:0].shape
 
 
+@pytest.mark.contract(function="conversions", regimes="general", properties="compile")
 @EACH
 def test_compiled_equals_eager(function, make):
     x = make(3, seed=5)

@@ -17,6 +17,7 @@ import error_interop
 import error_online
 import error_robot
 import error_splines
+import error_view
 import pytest
 from error_arguments import ACCEPTED, FOLDER, TOGETHER, Case
 
@@ -41,6 +42,7 @@ FILES = (
     error_robot,
     error_splines,
     error_calibration_files,
+    error_view,
 )
 CASES = [case for file in FILES for case in file.CASES]
 
@@ -101,6 +103,7 @@ def public() -> dict[str, Callable[..., Any]]:
         *error_generate.ROOTS,
         *error_robot.ROOTS,
         *error_calibration_files.ROOTS,
+        *error_view.ROOTS,
     ):
         visit(root)
     return found
@@ -125,6 +128,7 @@ RESULTS = {
     *error_generate.RESULTS,
     *error_robot.RESULTS,
     *error_splines.RESULTS,
+    *error_view.RESULTS,
 }
 
 #: Methods that are public by name alone, with nothing to get wrong.
@@ -133,6 +137,7 @@ UNTRIED = {
     "LowPass.extra_repr": "no arguments; PyTorch calls it",
     **error_generate.UNTRIED,
     **error_robot.UNTRIED,
+    **error_view.UNTRIED,
     "BSpline.extra_repr": "no arguments; PyTorch calls it",
     "BSpline.get_extra_state": "no arguments; PyTorch calls it",
     "BSpline.set_extra_state": "PyTorch calls it with what the method above made",
@@ -152,6 +157,7 @@ UNTRIED = {
 
 #: Parameters that take anything.
 FREE = {
+    **error_view.FREE,
     **dict.fromkeys(
         ("validate", "learnable", "degrees", "progress"), "a truth value, and everything has one"
     ),

@@ -29,6 +29,10 @@ def aligned(points, reference):
     return points * (points * reference).sum(-1, keepdim=True).sign()
 
 
+@pytest.mark.contract(
+    function="Problem.solve (differentiable)", arguments="measurements sigma covariance", regimes="general",
+    properties="first",
+)  # fmt: skip
 @pytest.mark.parametrize("group", [SO3, SE3, product(R3, SO3), Rn(2)], ids=str)
 def test_measurements_and_weights(group):
     points = start(group)
@@ -58,6 +62,10 @@ def test_measurements_and_weights(group):
     assert gradcheck(solution, inputs, atol=1e-6, rtol=1e-5, eps=1e-5, fast_mode=True)
 
 
+@pytest.mark.contract(
+    function="Problem.solve (differentiable)", arguments="measurements times sigma arguments", regimes="general",
+    properties="first",
+)  # fmt: skip
 def test_known_arguments_times_variables_and_a_robust_loss():
     points = start(SE3)
     truth = ts.BSpline(points, group=SE3, order=4, dt=0.5)

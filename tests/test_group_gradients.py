@@ -79,6 +79,7 @@ def test_transposes(group, short):
 # ---------------------------------------------------------------------- against finite differences
 
 
+@pytest.mark.contract(function="{case}", properties="first second")
 @each_case
 @each_group
 def test_first_and_second_derivatives(group, case):
@@ -141,6 +142,7 @@ def test_log_at_half_turns_has_the_gradient_of_its_side(group):
 # ---------------------------------------------------------------------- modes and precisions agree
 
 
+@pytest.mark.contract(function="{case}", properties="forward finite")
 @each_case
 @each_group
 def test_forward_mode_is_dual_to_reverse_mode(group, case):
@@ -183,6 +185,7 @@ def test_second_derivatives_along_a_line(group, case):
     assert abs(forward - backward) <= 1e-11 * (1 + abs(forward))
 
 
+@pytest.mark.contract(function="{case}", dtypes="float32", properties="single finite")
 @each_case
 @each_group
 def test_float32_gradients(group, case):
@@ -240,6 +243,7 @@ def test_hessians_follow_the_length_of_quaternions(group, case, dtype):
 # ---------------------------------------------------------------------- transformations
 
 
+@pytest.mark.contract(function="{case}", properties="vmap")
 @each_case
 @each_group
 def test_vmap_is_a_loop(group, case):
@@ -293,6 +297,7 @@ def test_hessians_in_every_mode(group, case):
             assert error(transposed, m, 2) < 60
 
 
+@pytest.mark.contract(function="{case}", properties="compile")
 @each_case
 def test_compiled_is_eager(case):
     given = [x.requires_grad_() for x in arguments(SE3, case, FEW)]

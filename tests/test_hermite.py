@@ -360,13 +360,15 @@ def test_transformations(coordinates):
     assert close(hessian, again, 1e-10)
 
 
+@pytest.mark.contract(function="hermite ({coordinates})", regimes="general", properties="compile")
 @pytest.mark.slow
 @each_kind
 def test_compiled_is_eager(coordinates):
-    given = [x.requires_grad_() for x in knots(SO3)]
+    given = [x.requires_grad_() for x in (*knots(SO3), T.clone(), TIMES.clone())]
 
     def call(*given):
-        return torch.cat(hermite(*given, T, group=SO3, times=TIMES, coordinates=coordinates)[:3], dim=-1)
+        *rows, t, times = given
+        return torch.cat(hermite(*rows, t, group=SO3, times=times, coordinates=coordinates)[:3], dim=-1)
 
     torch.compiler.reset()
     eager, compiled = call(*given), torch.compile(call, fullgraph=True, backend="aot_eager")(*given)

@@ -182,13 +182,13 @@ def test_what_is_written_is_read(tmp_path, format):
     # 1e-05 and 1e+22 are written without the point that YAML wants.
     noise = ImuNoise(1e-5, 0.1 + 0.2, 1e22, torch.full((3,), 7.0, dtype=F64))
     pose = SE3.random(generator=torch.Generator().manual_seed(0), dtype=F64)
-    whole = {"T_body_imu": pose} if format == "euroc" else {"topic": "/imu: 0 # it"}
+    whole = {"T_body_imu": pose} if format == "euroc" else {"topic": "/imu: 0 # it\n" + "is a long one " * 10}
     write_imu_parameters(path, ImuParameters(noise, 1 / 3, **whole), format=format)
     found = read_imu_parameters(path)
     assert found.rate == 1 / 3
     assert [getattr(found.noise, name) for name in DENSITIES] == [1e-5, 0.1 + 0.2, 1e22, 7.0]
     if format == "kalibr":
-        assert found.topic == "/imu: 0 # it"
+        assert found.topic == "/imu: 0 # it\n" + "is a long one " * 10
     else:
         assert torch.allclose(
             SE3.log(SE3.between(pose, found.T_body_imu)), torch.zeros(6, dtype=F64), atol=1e-14
@@ -223,6 +223,14 @@ def test_what_is_written_is_read(tmp_path, format):
             RESULT_FILE.replace("[1.01, 0.0", "[1.01, 0.1"),
             "key accelerometers.M: expected a lower triangular",
         ),
+        (
+            RESULT_FILE.replace("time_offset: 0.0", "time_offset: 0.01"),
+            "key time_offset: expected 0, .* got 0.01",
+        ),
+        (
+            RESULT_FILE.replace("time_offset: 0.0", "time_offset: .nan"),
+            "key time_offset: expected a finite number",
+        ),
         (RESULT_FILE.replace("C_gyro_i", "rx_i"), "key gyroscopes.rx_i: expected M, A or C_gyro_i"),
         (
             RESULT_FILE.replace("  model", "  accelerometers: 5\n  model"),
@@ -246,3 +254,10 @@ def test_files_that_are_none(tmp_path):
     with pytest.raises(ValueError, match="no text"):
         read_imu_parameters(tmp_path / "binary.yaml")
     assert io.ImuParameters is ImuParameters
+
+
+def test_files_that_cannot_be_written(tmp_path):
+    with pytest.raises(ValueError, match="expected a file, got a folder"):
+        write_imu_parameters(tmp_path, ImuParameters(EUROC, 200.0))
+    with pytest.raises(ValueError, match=r"one gyroscope_noise_density for all axes, got \[\]"):
+        write_imu_parameters(tmp_path / "imu.yaml", ImuParameters(ImuNoise(torch.ones(0, 3)), 200.0))

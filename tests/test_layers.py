@@ -21,7 +21,7 @@ LAYERS = [
     {"imu"},
     {"fit"},
     {"functional", "robot", "people", "io", "plot"},
-    {"cli_body", "generate", "calibrate"},
+    {"generate", "calibrate", "view", "explore"},
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -82,6 +82,15 @@ def test_shape_of_one_joint_and_irregular_times():
     assert abs(many.domain[1] - float(t[-1])) < 1e-9
 
 
+def test_missing_poses_are_named_before_memory_is_taken():
+    t = torch.arange(200, dtype=F64) / 60
+    t[100:] += 1e9
+    with pytest.raises(ValueError, match=r"t: expected at least .* for as many control points, got 200; cut"):
+        fit_body(t, walking(t)[0], bandwidth=5.0)
+    with pytest.raises(ValueError, match=r"frequencies: expected at least 4.8e-05 Hz at 60 Hz, got 1e-09"):
+        response(torch.tensor([1e-9], dtype=F64), 60.0, bandwidth=5.0)
+
+
 def test_response_is_what_a_fit_does():
     """A sine of 10 Hz along x: its acceleration in the fitted spline against `response`, and that keeps it."""
     frequencies = torch.tensor([1.0, 5.0, 10.0, 20.0, 25.0], dtype=F64)

@@ -37,6 +37,16 @@ def test_description():
     assert repr(ROBOT).startswith("Robot(4 joints: pan, roll, slide, close; 9 links")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1"])
+def test_encodings(tmp_path, encoding):
+    """Of the file, as it declares; text that declares one has been decoded already."""
+    declared = URDF.replace("utf-8", encoding.removesuffix("-sig")).replace("shoulder", "épaule")
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(declared.encode(encoding))
+    for source in (path, str(path), declared, "\ufeff\n" + declared.partition("\n")[2]):
+        assert "épaule" in Robot.from_urdf(source).links
+
+
 def test_poses_equal_products_of_matrices_in_float64():
     """Offsets are those of the file: float32 would be off by 1e-8."""
     for seed in range(5):

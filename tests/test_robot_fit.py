@@ -1,5 +1,7 @@
 """Splines of joints: from encoder logs, and from sensors on links."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from fit_oracle import check_assembly
 from robot_cases import F64, MOUNT, URDF, joint_spline, ur10e_log
 from scipy.interpolate import make_lsq_spline
 
-from torchspline import SE3, SO3, BSpline, Rn, fit, imu
+from torchspline import SE3, SO3, BSpline, Rn, fit, imu, use_kernels
 from torchspline.robot import Robot, fit_joints
 
 ROBOT = Robot.from_urdf(URDF)
@@ -31,6 +33,21 @@ def stamps(count):
 
 
 # ---------------------------------------------------------------------- sensors on links
+
+
+def test_sensors_on_links_go_through_pickle():
+    """To other processes: their classes are made on the way, and made again there."""
+    t = stamps(5)
+    made = ROBOT.residual("right", fit.Gyroscope, t, noise(5, 3), base=BASE, sigma=0.7)
+    again = pickle.loads(pickle.dumps(made))
+    assert type(again) is type(made)
+    costs = []
+    for residual in (made, again):
+        problem = fit.Problem(start(0.1))
+        problem.add(residual)
+        with use_kernels("reference"):
+            costs.append(problem.solve().cost)
+    assert costs[0] == costs[1]
 
 
 @pytest.mark.parametrize(
@@ -195,6 +212,21 @@ def test_delays_of_velocities_are_found(nanoseconds):
     without = fit_joints(times, *noisy, dt=0.1, position_sigma=1e-5, velocity_sigma=1e-3)
     assert without.velocity_delay is None
     assert without.velocity_residual.square().mean().sqrt() > 2e-3
+
+
+def test_joints_at_rest_have_no_delay_of_velocities():
+    """Neither an exact log of them nor one with noise, beside a joint that tells its own."""
+    t = torch.arange(200, dtype=F64) * 0.01
+    moving = torch.stack([torch.sin(6 * t), 6 * torch.cos(6 * (t - 0.004))])
+    for scale in (0.0, 1.0):
+        q = torch.stack([moving[0], torch.ones_like(t)], -1) + scale * 1e-6 * noise(200, 2)
+        rate = torch.stack([moving[1], torch.zeros_like(t)], -1) + scale * 1e-4 * noise(200, 2, seed=1)
+        delay = fit_joints(t, q, rate, dt=0.05, estimate_delay=True).velocity_delay
+        assert abs(delay[0] - 0.004) < 1e-4
+        assert abs(delay[1]) <= scale * 1e-3
+    at_rest = fit_joints(t, q[:, 1:].round(), 0 * t[:, None], dt="auto", estimate_delay=True)
+    assert at_rest.velocity_delay == 0.0
+    assert (at_rest.trajectory(t) - 1.0).abs().max() < 1e-9
 
 
 @pytest.mark.realdata

@@ -137,3 +137,15 @@ def test_gradients_of_rotation_products(mode):
         assert torch.autograd.gradgradcheck(products, (start, tangents), atol=1e-4)
         mapped = torch.func.vmap(products)(start.detach(), tangents.detach())
         assert torch.allclose(mapped, products(start, tangents), rtol=0, atol=1e-14)
+
+
+@MODES
+def test_slow_rotations_add_up_in_single_precision(mode):
+    """The earth's, seen at 200 Hz for ten minutes: a step is three times what a quaternion is rounded by."""
+    angle, count = 7.3e-5 * 0.005, 120_000
+    start = SO3.exp(torch.tensor([0.3, 0.2, 0.1], dtype=F64))
+    steps = SO3.exp(torch.tensor([0.0, 0.0, angle])).expand(count, 4)
+    with use_kernels(mode):
+        last = rotation_products(start.to(F32), steps)[-1].to(F64)
+    expected = SO3.compose(start, SO3.exp(torch.tensor([0.0, 0.0, count * angle], dtype=F64)))
+    assert SO3.log(SO3.between(last, expected)).norm() < 1e-5

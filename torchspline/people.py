@@ -21,6 +21,8 @@ _LEAST_SAMPLES = 1.2
 #: the first and last control points: in R^3 it does not matter where these are, on SO(3) they must stay near their
 #: neighbours. Repeated fits of what is left make up for it everywhere else.
 _SMOOTHNESS, _TURN_SMOOTHNESS = 1e-9, 1e-4
+#: Samples of a sine that `response` fits.
+_MOST_SAMPLES = 1e7
 #: Linear fits of what is left of rotations; the first leaves a percent to the second.
 _STEPS = 3
 
@@ -71,11 +73,13 @@ def fit_body(t: Tensor, poses: Tensor, *, bandwidth: float, order: int = 6) -> S
     spacing, span = _spacing(bandwidth, float(times.diff().median())), float(times[-1] - times[0])
     # The last knot on the last pose: a control point with next to no poses would be anywhere.
     spacing = span / math.ceil(span / spacing - 1e-6)
-    knots = Knots(times, spacing, order)
-    if knots.count > len(times):
+    count = round(span / spacing) + order - 1
+    if count > len(times):
         raise ValueError(
-            f"t: expected at least {knots.count} times for as many control points, got {len(times)}"
+            f"t: expected at least {count} times over {span:g} s for as many control points, got {len(times)}; "
+            "cut the motion where poses are missing"
         )
+    knots = Knots(times, spacing, order)
     single = poses.ndim == 2
     measured = consistent_signs(poses.detach().to("cpu", torch.float64).reshape(-1, len(times), 7), _SPLIT)
     positions = _linear(knots, times, measured[..., :3], _SMOOTHNESS)
@@ -137,6 +141,11 @@ def response(frequencies: Tensor, rate: float, *, bandwidth: float, order: int =
     w = 2.0 * math.pi * frequencies.detach().to("cpu", torch.float64).numpy()
     # Long enough to be alike in the middle, wherever knots and samples stand to each other.
     duration = max(100.0 * spacing, 8.0 * 2.0 * math.pi / float(w.min()) if len(w) else 0.0)
+    if duration * rate > _MOST_SAMPLES:
+        raise ValueError(
+            f"frequencies: expected at least {8.0 * rate / _MOST_SAMPLES:.2g} Hz at {rate:g} Hz, "
+            f"got {frequencies.min().item():g}"
+        )
     t = torch.arange(0.0, duration, 1.0 / rate, dtype=torch.float64)
     knots = Knots(t, spacing, order)
     phase = t.numpy()[:, None] * w

@@ -142,6 +142,11 @@ def variable(u: Scalar, degree: int) -> Jet:
     return Jet(u, *((1.0,) if degree > 0 else ()), *(0.0,) * (degree - 1))
 
 
+def constant(x: Scalar, degree: int) -> Jet:
+    """x, known up to s^degree."""
+    return Jet(x, *(0.0,) * degree)
+
+
 def derivative(x: Scalar) -> Scalar:
     """dx/ds, known one degree less far."""
     if not isinstance(x, Jet):

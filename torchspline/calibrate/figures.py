@@ -126,10 +126,11 @@ def readings(calibration: Calibration, j: int) -> bytes:
                            _predicted(imu.accelerometer, record.accelerometer, both, shown))  # fmt: skip
     measured = ImuReading(record.gyroscope[both][shown], record.accelerometer[both][shown])
     file = io.BytesIO()
-    imu_comparison(
-        file, (t[shown], predicted), (t[shown], measured), f"{imu.name}: the {_EXCERPT:g} s of most motion",
+    figure = imu_comparison(
+        (t[shown], predicted), (t[shown], measured), f"{imu.name}: the {_EXCERPT:g} s of most motion",
         ("estimated", "measured"),
     )  # fmt: skip
+    figure.savefig(file, dpi=130)
     return file.getvalue()
 
 

@@ -90,6 +90,14 @@ def fit_poses(
         PoseFit, on the CPU in float64.
     Raises:
         TypeError, ValueError: a wrong type, shape or value; fewer than two distinct usable times.
+    Examples:
+        >>> import torch
+        >>> t = torch.linspace(0, 1, 50, dtype=torch.float64)
+        >>> poses = torch.stack([t, t.sin(), 0 * t, 1 + 0 * t, 0 * t, 0 * t, 0 * t], dim=-1)
+        >>> fit = fit_poses(t, poses, dt=0.2, progress=False)
+        >>> position, rotation = fit.rms()
+        >>> position < 1e-6, fit.trajectory.domain[0]
+        (True, 0.0)
     """
     group = _group(representation)
     _check(t, poses)

@@ -36,6 +36,16 @@ class Problem:
 
     Args:
         trajectory: a `BSpline` without a batch, on any group, on the CPU. Solving moves its control points in place.
+    Examples:
+        >>> import torch
+        >>> from torchspline import R3, BSpline
+        >>> from torchspline.fit import StateValue
+        >>> spline = BSpline(torch.zeros(8, 3, dtype=torch.float64), group=R3, order=4, dt=0.2)
+        >>> t = torch.linspace(0, 1, 30, dtype=torch.float64)
+        >>> problem = Problem(spline)
+        >>> residual = problem.add(StateValue(t, torch.stack([t, t * t, 0 * t], dim=-1), sigma=0.1))
+        >>> problem.solve(progress=False).converged
+        True
     """
 
     def __init__(self, trajectory: BSpline):

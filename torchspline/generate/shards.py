@@ -300,7 +300,8 @@ def _array(x: Column) -> Any:
     numbers = x.contiguous().numpy()
     if numbers.ndim == 1:
         return library.array(numbers)
-    return library.FixedShapeTensorArray.from_numpy_ndarray(numbers)
+    # The strides of a single item may be anything, in which Arrow finds fault: those of a flat array are not.
+    return library.FixedShapeTensorArray.from_numpy_ndarray(numbers.reshape(-1).reshape(numbers.shape))
 
 
 def _column(x: Any) -> Column:

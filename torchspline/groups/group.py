@@ -17,7 +17,7 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Group:
-    """A Lie group by name: "SO3", "SE3", "DualQuaternion", "SO2", "SE2", "R<n>", or a direct product such as "R3xSO3".
+    """A Lie group by name: "SO3", "SE3", "DualQuaternion", "SO2", "SE2", `"R<n>"`, or a product such as "R3xSO3".
 
     Points are tensors `(..., point_size)`, tangents `(..., tangent_size)`, [v, omega] in m and rad; leading dimensions
     broadcast. Every method is differentiable in its tensors to any order, forwards and backwards; `log`,
@@ -25,6 +25,15 @@ class Group:
     have any length from 1e-15 to 1e15: no function depends on it, and gradients are orthogonal to them. Methods
     raise `TypeError` for a wrong dtype or type and `ValueError` for a wrong shape, device or value (values are
     looked at on the CPU only).
+    Examples:
+        >>> import torch
+        >>> start, end = SE3.identity(), torch.tensor([1.0, 0, 0, 0, 0, 0, 1], dtype=torch.float64)
+        >>> SE3.log(SE3.between(start, end))[3:].norm().item()  # half a turn
+        3.141592653589793
+        >>> SE3.interpolate(start, end, torch.tensor(0.5, dtype=torch.float64)).shape
+        torch.Size([7])
+        >>> product(R3, SO3).tangent_size
+        6
     """
 
     name: str

@@ -24,6 +24,8 @@ COMPONENTS = ("white_noise", "bias_instability", "random_walk", "quantization")
 _PER_DECADE, _LONGEST = 10, 0.25
 #: How far from a multiple of the sample interval stamps may lie apart, in intervals.
 _JITTER = 0.35
+#: Samples that are missing for each that is there, at most: memory goes with both.
+_SPARSEST = 100
 #: Frequencies of the integrals behind covariances, log-spaced.
 _FREQUENCIES = 4000
 _ROUNDS = 4
@@ -88,7 +90,8 @@ def allan_deviation(x: Tensor, t: Tensor, clusters: Sequence[int] | None = None)
         x: record at rest, float32 or float64, (*batch, N, C); sums are taken in float64.
         t: increasing times, seconds (float) or nanoseconds (int64), (N,): multiples of one interval, with jitter below
             a third of it.
-        clusters: numbers of samples in a cluster; None: ten a decade up to a quarter of the record.
+        clusters: numbers of samples in a cluster; None: ten a decade up to a quarter of the record, as far as two of
+            them fit between gaps.
     Returns:
         AllanDeviation: in float64 on the CPU.
     Raises:
@@ -129,14 +132,17 @@ def allan_deviation(x: Tensor, t: Tensor, clusters: Sequence[int] | None = None)
             terms.append(complete.sum(-2).to(torch.float64))
             difference = difference * complete
         variances.append(0.5 * difference.square().sum(-2) / terms[-1])
-    used = torch.stack(terms, -2)
-    if (used == 0).any():
-        least = sizes[int(torch.nonzero(used == 0)[:, -2].min())]
+    used, variance = torch.stack(terms, -2), torch.stack(variances, -2)
+    missing = (used == 0).any(-1).reshape(-1, len(sizes)).any(0)
+    if clusters is None and not bool(missing.all()):  # of those not asked for, the ones that fit
+        used, variance = used[..., ~missing, :], variance[..., ~missing, :]
+        sizes = [m for m, gone in zip(sizes, missing.tolist(), strict=True) if not gone]
+    elif bool(missing.any()):
+        least = sizes[missing.tolist().index(True)]
         raise ValueError(
             "clusters: expected sizes of which two fit between gaps of the record, "
             f"got {least} samples, {least * interval:g} s"
         )
-    variance = torch.stack(variances, -2)
     m = torch.tensor(sizes, dtype=torch.float64)
     degrees = _degrees(variance, used, m)
     return AllanDeviation(m * interval, variance.sqrt(), torch.tensor(sizes), used, degrees, interval)
@@ -174,6 +180,14 @@ def fit_noise(
         raise ValueError(
             f"tau: expected a range with more cluster times than components ({len(names)}), got {len(used)}"
         )
+    smallest = allan.deviation[..., used, :]
+    if not bool((smallest.square() > 0).all()):
+        where = torch.nonzero(smallest.square() == 0)[0].tolist()
+        raise ValueError(
+            f"allan: expected deviations above zero, got {smallest[tuple(where)].item()} over "
+            f"{allan.tau[used][where[-2]].item():g} s in channel {where[-1]}: a record that is constant, or whose "
+            "resolution hides its noise; leave that channel, or those cluster times (tau), out"
+        )
     m, dt = allan.clusters[used].numpy().astype(np.float64), allan.interval
     f = np.geomspace(0.02 / (m[-1] * dt), 0.5 / dt, _FREQUENCIES)
     transfer = _transfer(f, m, dt)
@@ -187,7 +201,10 @@ def fit_noise(
         )
     ]
     shape = (*batch, allan.deviation.shape[-1])
-    value, std = (torch.from_numpy(np.array([row[i] for row in rows])).reshape(*shape, -1) for i in (0, 1))
+    value, std = (
+        torch.from_numpy(np.array([row[i] for row in rows], dtype=np.float64)).reshape(*shape, len(names))
+        for i in (0, 1)
+    )
     return NoiseEstimate(
         {name: value[..., i] for i, name in enumerate(names)},
         {name: std[..., i] for i, name in enumerate(names)},
@@ -271,6 +288,12 @@ def _grid(steps: Tensor) -> tuple[float, Tensor]:
     # The mean of single steps: jitter of single stamps, which a median keeps, cancels in it.
     single = steps[steps < 1.5 * steps.median()].mean()
     multiples = (steps / single).round()
+    if multiples.sum() > _SPARSEST * len(steps):
+        at = int(steps.argmax())
+        raise ValueError(
+            f"t: expected a record of which more than one sample in {_SPARSEST} is there, got a gap of "
+            f"{steps[at].item():g} s between samples {at} and {at + 1}; cut it there"
+        )
     off = (steps / single - multiples).abs()
     if bool((off > _JITTER).any()) or bool((multiples < 1).any()):
         at = int(torch.nonzero((off > _JITTER) | (multiples < 1))[0])

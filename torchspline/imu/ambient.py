@@ -11,9 +11,18 @@ from torchspline.groups.group import SO3
 from torchspline.imu.earth import standard_pressure
 from torchspline.imu.filters import LowPass
 from torchspline.imu.noise import Generators, random_walk, white_noise
-from torchspline.imu.parts import above_zero, along_time, drawing_device, keep, mean_rate, tensor_of, times_of
+from torchspline.imu.parts import (
+    above_zero,
+    along_time,
+    batch_of,
+    drawing_device,
+    keep,
+    sample_rate,
+    tensor_of,
+    times_of,
+)
 from torchspline.imu.quantise import quantise, saturate
-from torchspline.imu.sampling import Sampling
+from torchspline.imu.sampling import Sampling, in_order
 from torchspline.splines.trajectory import Kinematics, Trajectory
 
 Given = Tensor | Sequence[float] | float | None
@@ -93,13 +102,18 @@ class _Ambient(nn.Module):
     def _sensed(self, trajectory: Trajectory, t: Tensor, generator: Generators) -> AmbientReadings:
         times_of(t, trajectory)
         at = t.reshape(1) if t.ndim == 0 else t
-        instants, valid = self.sampling(trajectory, at, generator)
+        own = self._batches()
+        if self.sampling.random:
+            own["trajectory"] = batch_of(trajectory, at)
+        instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
         motion = trajectory.kinematics(instants)
         moving = motion.rotation if motion.rotation is not None else motion.position
         assert moving is not None
         checks.broadcast(trajectory=moving.shape[:-2], **self._batches())
         signal = self._signal(motion)
         if self.low_pass is not None:
+            if self.sampling.jitter is not None:
+                in_order(instants)
             signal = self.low_pass(signal, instants)
         if self.dtype is not None:
             signal = signal.to(self.dtype)
@@ -116,7 +130,8 @@ class _Ambient(nn.Module):
         white, walk = densities
         home = drawing_device(generator, signal.device)
         if white is not None:
-            rate = mean_rate(at) if self.rate is None else self.rate
+            rate = sample_rate(at.to(home), self.rate)
+            rate = rate if rate.ndim == 0 else rate[..., None, None]
             drawn = white_noise(shape, white.to(home), rate, generator, signal.dtype)
             signal = signal + drawn.to(signal.device)
         if walk is not None:

@@ -63,6 +63,8 @@ class LowPass(nn.Module):
             raise ValueError(f"x: expected shape (*batch, N, C), got {tuple(x.shape)}")
         batch = checks.broadcast(x=x.shape[:-2], t=t.shape[:-1]) if isinstance(t, Tensor) else x.shape[:-2]
         step = stamps.intervals(t, (*batch, x.shape[-2]), torch.float64, device=x.device)
+        if step.shape[-1] == 0:  # a single sample, or none: as constant as it has been before
+            return x.expand(*batch, *x.shape[-2:])
         pole, gain = self._pole()
         tracked = torch.is_grad_enabled() and any(y.requires_grad for y in (x, step, pole))
         if not tracked and usable(x, step, self.bandwidth):
@@ -106,9 +108,7 @@ def _reference(x: Tensor, step: Tensor, pole: Tensor, gain: Tensor) -> Tensor:
     u = x.to(torch.float64)
     driven = share * (before * u[..., :-1, :] + now * u[..., 1:, :])
     start = -share * u[..., :1, :].expand(*driven.shape[:-2], 1, driven.shape[-1])
-    factor = torch.cat([torch.ones_like(through[..., :1, :]), through], -2) if step.shape[-1] else through
-    if not step.shape[-1]:
-        return x
+    factor = torch.cat([torch.ones_like(through[..., :1, :]), through], -2)
     states = prefix(
         _follow, (factor.expand(*driven.shape[:-2], -1, driven.shape[-1]), torch.cat([start, driven], -2))
     )[1]

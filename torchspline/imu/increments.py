@@ -69,8 +69,8 @@ def increments(
     if t.ndim == 0:
         raise ValueError("t: expected shape (N,) or (*batch, N), times in a row, got ()")
     h = stamps.intervals(t, v.shape[:-1], v.dtype, device=v.device)[..., None]
-    g = _vector("gravity", gravity, v)
-    rate = None if earth_rate is None else _vector("earth_rate", earth_rate, v)
+    g = world_vector("gravity", gravity, v)
+    rate = None if earth_rate is None else world_vector("earth_rate", earth_rate, v)
     start, end = q[..., :-1, :], q[..., 1:, :]
     if compensated and rate is None:
         return Increments(_log(_between(start, end)), _unturn(start, v.diff(dim=-2) - g * h))
@@ -202,6 +202,17 @@ def _readings(motion: Kinematics, g: Tensor, rate: Tensor | None) -> tuple[Tenso
         force = force + 2.0 * torch.linalg.cross(rate.expand_as(force), motion.velocity)
         w = w + _unturn(motion.rotation, rate.expand_as(w))
     return w, _unturn(motion.rotation, force)
+
+
+def world_vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    """A vector (3,), or (*batch, 1, 3): one for all samples of `like` (*batch, N, 3).
+
+    Numbers of samples and of intervals differ, so that (N, 3) would go with one of them and not with the other.
+    """
+    x = _vector(name, x, like)
+    if x.ndim > 1 and x.shape[-2] != 1:
+        raise ValueError(f"{name}: expected shape (3,), or (*batch, 1, 3), got {tuple(x.shape)}")
+    return x
 
 
 def _ends(x: Tensor) -> tuple[Tensor, Tensor]:

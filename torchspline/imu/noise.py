@@ -246,7 +246,9 @@ def _normals(shape: torch.Size, generator: Generators, dtype: torch.dtype, devic
             f"got {len(generators)}"
         )
     rows = [partial(_fill, row, g) for row, g in zip(x, generators, strict=True)]
-    if x.numel() < threads.SERIAL_BELOW or device.type != "cpu":
+    # One generator for several rows fills them in their order, which threads would not keep to.
+    shared = len({id(g) for g in generators}) < len(generators)
+    if shared or x.numel() < threads.SERIAL_BELOW or device.type != "cpu":
         for fill in rows:
             fill()
     else:
@@ -272,6 +274,8 @@ def _range(correlation_times: tuple[float, float]) -> tuple[float, float]:
         ) from None
     for x in (shortest, longest):
         checks.positive("correlation_times", x)
+    if not math.isfinite(longest / shortest):
+        raise ValueError(f"correlation_times: expected a ratio that is a number, got {correlation_times}")
     if longest < shortest:
         raise ValueError(
             f"correlation_times: expected the shortest and then the longest, got {correlation_times}"

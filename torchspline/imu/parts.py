@@ -93,15 +93,34 @@ def times_of(t: Tensor, trajectory: Trajectory) -> Tensor:
     return t
 
 
-def mean_rate(t: Tensor) -> float:
-    """Samples per second of a sensor that took its samples at `t`, (..., N)."""
+def sample_rate(t: Tensor, rate: float | None) -> Tensor:
+    """Samples per second of the sensor: `rate`, (), or else the mean over the stamps `t` (*batch, N), (*batch,).
+
+    Each row has its own: what one of a batch reads must not depend on the stamps of the others.
+    """
+    if rate is not None:
+        return torch.tensor(float(rate), dtype=torch.float64, device=t.device)
     if t.shape[-1] < 2:
-        raise ValueError("rate: expected samples per second where there is a single stamp, got None")
-    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64).mean().item()
+        raise ValueError(
+            f"rate: expected samples per second where stamps have no interval ({t.shape[-1]} of them), got None"
+        )
+    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64)
     seconds = span * 1e-9 if t.dtype == torch.int64 else span
-    if not seconds > 0:
-        raise ValueError(f"t: expected increasing times, got a duration of {seconds:g} s")
+    if checks.values_visible(seconds) and checks.seen_true((seconds > 0).all()) is False:
+        raise ValueError(f"t: expected increasing times, got a duration of {seconds.min().item():g} s")
     return (t.shape[-1] - 1) / seconds
+
+
+def batch_of(trajectory: Trajectory, t: Tensor) -> torch.Size:
+    """The batch of readings of the trajectory at the times `t`, (N,) or (*batch, N)."""
+    if t.shape[-1] == 0:
+        return t.shape[:-1]
+    start, stop = trajectory.domain
+    with torch.no_grad():
+        motion = trajectory.kinematics(t.detach()[..., :1].clamp(start, stop))
+    moving = motion.rotation if motion.rotation is not None else motion.position
+    assert moving is not None
+    return moving.shape[:-2]
 
 
 def drawing_device(generator: Any, device: torch.device) -> torch.device:

@@ -30,8 +30,8 @@ class Sampling(nn.Module):
     Args:
         time_offset: s, by which stamps are late; a number or (*batch,).
         time_skew: s/s; a number or (*batch,).
-        jitter: s, standard deviation, independent from sample to sample.
-        drop_probability: of each sample to be lost, independently; at least 0, below 1.
+        jitter: s, standard deviation, independent from sample to sample and from one of a batch to the next.
+        drop_probability: of each sample to be lost, likewise independently; at least 0, below 1.
     """
 
     time_offset: Tensor | None
@@ -68,10 +68,22 @@ class Sampling(nn.Module):
             if checks.seen_true(largest < 1.0) is False:
                 raise ValueError(f"{name}: expected numbers below 1, got {largest.item():g}")
 
-    def forward(self, trajectory: Trajectory, t: Tensor, generator: Generators = None) -> Instants:
+    @property
+    def random(self) -> bool:
+        """Whether it draws random numbers."""
+        return self.jitter is not None or self.drop_probability is not None
+
+    def forward(
+        self,
+        trajectory: Trajectory,
+        t: Tensor,
+        generator: Generators = None,
+        batch: Sequence[int] = (),
+    ) -> Instants:
         """Instants of the samples with stamps `t` (N,) or (*batch, N), seconds or int64 nanoseconds.
 
-        Jitter does not reach beyond a domain whose trajectory refuses times outside.
+        Jitter does not reach beyond a domain whose trajectory refuses times outside. Each sensor of the `batch` has
+        jitter and losses of its own.
         """
         own = {n: x.shape for n, x in (*self._parameters.items(), *self._buffers.items()) if x is not None}
         checks.broadcast(t=t.shape[:-1], **own)
@@ -90,13 +102,10 @@ class Sampling(nn.Module):
         elif self.time_offset is not None:
             late = _column(self.time_offset)
         at = t if late is None else shifted(t, -late)
-        batch = at.shape[:-1]
-        for x in (self.jitter, self.drop_probability):
-            if x is not None:
-                batch = torch.broadcast_shapes(batch, x.shape)
         valid = torch.ones((), dtype=torch.bool, device=t.device).expand(at.shape)
-        if self.jitter is None and self.drop_probability is None:
+        if not self.random:
             return Instants(at, valid)
+        batch = checks.broadcast(batch=batch, t=at.shape[:-1], **own)
         if isinstance(generator, Sequence) and not batch:
             batch = torch.Size([len(generator)])
         # Two columns whatever is used, so that one effect does not change the random numbers of another.
@@ -126,6 +135,18 @@ def shifted(t: Tensor, by: Tensor) -> Tensor:
             "torch.int64; whole nanoseconds have no gradient"
         )
     return t + (by / _NANOSECOND).round().to(torch.int64)
+
+
+def in_order(instants: Tensor) -> Tensor:
+    """The instants themselves, which a filter needs to increase, as jitter may not let them."""
+    steps = instants.detach().diff(dim=-1)
+    if checks.values_visible(steps) and steps.numel() and checks.seen_true((steps > 0).all()) is False:
+        unit = _NANOSECOND if instants.dtype == torch.int64 else 1.0
+        raise ValueError(
+            "jitter: expected instants that increase, as stamps do, where a filter follows, got two "
+            f"{steps.min().item() * unit:g} s apart; choose one well below the interval of stamps, and these increasing"
+        )
+    return instants
 
 
 def excursion(trajectory: Trajectory, t: Tensor, by: Tensor) -> Tensor:

@@ -122,7 +122,8 @@ class _RotationProducts(Function):
         batch, rows = steps.shape[:-2], steps.shape[:-2].numel()
         first = start.detach().contiguous().reshape(rows, 4).numpy()
         plain = steps.detach().contiguous().reshape(rows, steps.shape[-2], 4).numpy()
-        products = torch.from_numpy(recurrence.rotation_products(first, plain)).reshape(*batch, -1, 4)
+        products = torch.from_numpy(recurrence.rotation_products(first, plain))
+        products = products.reshape(*batch, steps.shape[-2] + 1, 4)
         ctx.save_for_backward(start, steps, products)
         return products
 

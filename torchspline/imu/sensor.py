@@ -26,19 +26,21 @@ from torchspline.imu.parameters import ImuNoise
 from torchspline.imu.parts import (
     above_zero,
     along_time,
+    batch_of,
     bias_of,
     drawing_device,
     keep,
-    mean_rate,
+    sample_rate,
     tensor_of,
     times_of,
 )
 from torchspline.imu.quantise import quantise, saturate
-from torchspline.imu.sampling import Sampling, excursion
+from torchspline.imu.sampling import Sampling, excursion, in_order
 from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading
 from torchspline.kernels.mode import plain
 from torchspline.splines.trajectory import MECHANICS, Trajectory
 
+BIASES = ("gyroscope_bias", "accelerometer_bias")
 Given = Tensor | Sequence[float] | float | None
 
 
@@ -78,7 +80,7 @@ class Imu(nn.Module):
 
     Args:
         noise: densities and random biases; None: no noise.
-        rate: Hz, samples per second that the sensor takes; None: from the mean interval of the stamps.
+        rate: Hz, samples per second that the sensor takes; None: from the mean interval of the stamps, of each row.
         gyroscope_bias, accelerometer_bias: (3,) rad/s and m/s^2, or a trajectory in R3, read at the instants.
         gyroscope_scale, accelerometer_scale: (3,) factors, 1 is perfect; above zero.
         gyroscope_misalignment, accelerometer_misalignment: (3,) entries yx, zx, zy of lower triangular matrices.
@@ -237,7 +239,11 @@ class Imu(nn.Module):
                 f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
             )
         at = t.reshape(1) if t.ndim == 0 else t
-        instants, valid = self.sampling(trajectory, at, generator)
+        own = self._batches()
+        if self.sampling.random:
+            biases = {n: x for n in BIASES if isinstance(x := getattr(self, n), Trajectory)}
+            own |= {name: batch_of(x, at) for name, x in {"trajectory": trajectory, **biases}.items()}
+        instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
         signal = self._filtered(self._exposure(trajectory, at, instants), instants)
         checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
         if self.dtype is not None:
@@ -280,6 +286,10 @@ class Imu(nn.Module):
             TypeError, ValueError: a wrong type, shape or dtype; a bias that is a trajectory and is not given here.
         """
         _check_readings(readings)
+        if isinstance(readings, Readings) and readings.t.ndim == 0:  # as a row of one
+            row = ImuReading(readings.gyroscope.unsqueeze(-2), readings.accelerometer.unsqueeze(-2))
+            biases = (x if x is None else x.unsqueeze(-2) for x in (gyroscope_bias, accelerometer_bias))
+            return ImuReading(*(x.squeeze(-2) for x in self.correct(row, *biases)))
         parts = []
         for name, x, given in (
             ("gyroscope_bias", readings.gyroscope, gyroscope_bias),
@@ -317,10 +327,16 @@ class Imu(nn.Module):
             Increments: (*batch, N, 3).
         Differentiable in readings and t.
         Raises:
-            TypeError, ValueError: a wrong type, shape or value.
+            TypeError, ValueError: a wrong type, shape or value, or samples that were lost.
         """
         _check_readings(readings)
         w, f = readings.gyroscope, readings.accelerometer
+        valid = getattr(readings, "valid", None)
+        if valid is not None and checks.values_visible(valid) and checks.seen_true(valid.all()) is False:
+            raise ValueError(
+                f"readings: expected samples that all arrived, got {int((~valid).sum())} lost ones, which read zero; "
+                "fill them in, or leave them out with their stamps"
+            )
         if not self.averaging:
             return sampled_increments(ImuReading(w, f), t)
         h = stamps.intervals(t, w.shape[:-1], w.dtype, device=w.device).unsqueeze(-1)
@@ -343,11 +359,11 @@ class Imu(nn.Module):
         if not self.averaging:
             return exposure(trajectory, instants, scene)
         nodes, weights = np.polynomial.legendre.leggauss(self.averaging)
-        interval = 1.0 / self._rate(at)
+        interval = 1.0 / sample_rate(at, self.rate)
+        interval = interval if interval.ndim == 0 else interval.unsqueeze(-1)
         total: Tensor | None = None
         for node, weight in zip(nodes, weights, strict=True):
-            back = torch.tensor(0.5 * (node - 1.0) * interval, dtype=torch.float64, device=instants.device)
-            part = exposure(trajectory, excursion(trajectory, instants, back), scene)
+            part = exposure(trajectory, excursion(trajectory, instants, 0.5 * (node - 1.0) * interval), scene)
             total = part * (0.5 * weight) if total is None else torch.add(total, part, alpha=0.5 * weight)
         assert total is not None
         return total
@@ -356,6 +372,8 @@ class Imu(nn.Module):
         first, second = self.gyroscope_filter, self.accelerometer_filter
         if first is None and second is None:
             return signal
+        if self.sampling.jitter is not None:
+            in_order(t)
         if first is second and first is not None:
             return first(signal, t)
         gyroscope, accelerometer = signal[..., :3], signal[..., 3:]
@@ -385,7 +403,7 @@ class Imu(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         """Bias (..., 1 or N, 6) and white noise (..., N, 6)."""
         parts = []
-        for bias in (self.gyroscope_bias, self.accelerometer_bias):
+        for bias in (getattr(self, name) for name in BIASES):
             if isinstance(bias, Trajectory):
                 parts.append(bias(instants).to(signal))
             elif bias is None:
@@ -431,7 +449,9 @@ class Imu(nn.Module):
         own = densities["noise_density"]
         if own is None:
             return bias, None
-        white = white_noise(shape, own, self._rate(at), generator, signal.dtype)
+        rate = sample_rate(t, self.rate)
+        rate = rate if rate.ndim == 0 else rate[..., None, None]
+        white = white_noise(shape, own, rate, generator, signal.dtype)
         return bias, white.to(signal.device)
 
     def _converted(self, signal: Tensor) -> Tensor:
@@ -442,7 +462,8 @@ class Imu(nn.Module):
         if step is not None:
             fine = step == 0.0  # one sensor has a resolution, the other has none
             rounded = quantise(signal, torch.where(fine, 1.0, step))
-            signal = torch.where(fine, signal, rounded) if fine.any() else rounded
+            whole = self.gyroscope_resolution is not None and self.accelerometer_resolution is not None
+            signal = rounded if whole else torch.where(fine, signal, rounded)
         return signal
 
     def _pair(self, name: str, like: Tensor, missing: float) -> Tensor | None:
@@ -451,9 +472,6 @@ class Imu(nn.Module):
         if all(x is None for x in both):
             return None
         return _joined(*(like.new_full((3,), missing) if x is None else along_time(x, like) for x in both))
-
-    def _rate(self, at: Tensor) -> float:
-        return mean_rate(at) if self.rate is None else self.rate
 
 
 def _check_readings(readings: Any) -> None:

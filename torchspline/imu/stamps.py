@@ -8,6 +8,9 @@ from torch import Tensor
 from torchspline import checks
 
 _NANOSECOND = 1e-9
+#: What float32 may round off times, as a share of the mean interval. That errors of intervals sum to nothing is why it
+#: may be more than the thousandth of a spline's spacing.
+_ROUNDED = 0.05
 
 
 def intervals(
@@ -20,10 +23,11 @@ def intervals(
     """Seconds between neighbouring times, (..., N - 1); differences are taken before any rounding.
 
     Args:
-        t: seconds (float) or nanoseconds (int64), (N,) or what broadcasts to `samples`. samples: (*batch, N).
+        t: seconds (float; in float32 within 2000 s of zero at 200 Hz) or nanoseconds (int64), (N,) or what broadcasts
+            to `samples`. samples: (*batch, N).
         repeated: whether times may be equal. device: where the samples are, if they are somewhere.
     Raises:
-        TypeError, ValueError: not times, of a wrong shape, or not increasing.
+        TypeError, ValueError: not times, of a wrong shape, not increasing, or float32 too far from zero.
     """
     if not isinstance(t, Tensor):
         raise TypeError(
@@ -57,5 +61,21 @@ def intervals(
         a, b = (t.detach()[(*at[:-1], at[-1] + i)].item() for i in (0, 1))
         expected = "times that do not decrease" if repeated else "increasing times"
         raise ValueError(f"t: expected {expected}, got {a} and then {b}")
+    if t.dtype == torch.float32:
+        _check_rounding(t.detach(), steps.detach())
     seconds = steps.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else steps
     return seconds.to(dtype)
+
+
+def _check_rounding(t: Tensor, steps: Tensor) -> None:
+    """Refuses single precision where intervals are made of rounding errors."""
+    if steps.numel() == 0 or not checks.values_visible(t):
+        return
+    rounding = torch.finfo(torch.float32).eps * t.abs().amax(-1)
+    interval = steps.mean(-1)
+    if checks.seen_true(((rounding > _ROUNDED * interval) & (interval > 0)).any()):
+        raise ValueError(
+            f"t: float32 rounds times near {t.abs().max().item():.3g} s to {rounding.max().item():.1g} s, more than "
+            f"a twentieth of the interval of {interval.min().item():.3g} s; pass float64 times, int64 nanoseconds, or "
+            "times relative to a nearer origin"
+        )

@@ -16,9 +16,10 @@ from torchspline.imu.increments import (
     _turn,
     mean_turn,
     rotation_between_samples,
+    world_vector,
 )
 from torchspline.imu.scan import rotation_products
-from torchspline.imu.synthesis import STANDARD_GRAVITY, _vector
+from torchspline.imu.synthesis import STANDARD_GRAVITY
 
 
 class Navigation(NamedTuple):
@@ -94,12 +95,12 @@ def strapdown(
         _start(f"start.{name}", x, angle, "angle", width)
         for name, x, width in zip(Navigation._fields, start, (4, 3, 3), strict=True)
     )
-    g = _vector("gravity", gravity, angle)
+    g = world_vector("gravity", gravity, angle)
     rotation = _rotations(angle, q0)
     if earth_rate is None:
         velocity = _running(v0, _turn(rotation[..., :-1, :], gained) + g * h)
     else:
-        rate = _vector("earth_rate", earth_rate, angle)
+        rate = world_vector("earth_rate", earth_rate, angle)
         elapsed = _running(torch.zeros_like(v0[..., :1]), h.expand(*angle.shape[:-1], 1))
         # The products so far are in axes that do not turn. Velocity obeys v' + 2 rate x v = force + gravity, of which
         # Exp(2 rate t) v is an integral of the right side alone.

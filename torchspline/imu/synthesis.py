@@ -43,6 +43,12 @@ def measure(
     Differentiable in control points, times, gravity, biases and T_body_imu.
     Raises:
         TypeError, ValueError: a wrong type, shape or value, or a trajectory without rotation or position.
+    Examples:
+        >>> import torch
+        >>> from torchspline import SE3, BSpline
+        >>> still = BSpline(SE3.identity(4, dtype=torch.float64), group=SE3, dt=1.0)
+        >>> measure(still, torch.tensor([0.5], dtype=torch.float64)).accelerometer.tolist()
+        [[0.0, 0.0, 9.80665]]
     """
     checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
     if trajectory.group.name not in MECHANICS:

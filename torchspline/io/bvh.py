@@ -183,8 +183,9 @@ class _Parser:
                 return
             elif kind == ("JOINT" if stack else "ROOT"):
                 self.joint(stack, " ".join(rest))
-            elif kind == "END" and stack and [x.upper() for x in rest] == ["SITE"]:
-                self.joint(stack, f"{self.names[stack[-1]]} end")
+            elif kind == "END" and stack and " ".join(rest).upper().removesuffix("{").strip() == "SITE":
+                brace = "{" if rest[-1].endswith("{") else ""
+                self.joint(stack, f"{self.names[stack[-1]]} end{brace}")
             elif kind == "OFFSET" and stack and not self.offsets[stack[-1]]:
                 self.offsets[stack[-1]] = self.numbers(rest, 3, "x, y, z of an offset")
             elif kind == "CHANNELS" and stack and not self.channels[stack[-1]]:

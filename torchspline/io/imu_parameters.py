@@ -79,6 +79,11 @@ def read_imu_parameters(path: str | PathLike[str], inflation: float = 1.0) -> Im
         isinstance(x, dict) and str(k).startswith("imu") for k, x in content.items()
     ):
         content = next(iter(content.values()))
+    if content.get("time_offset") and _finite(path, content, "time_offset") != 0:
+        raise ValueError(
+            f"{path}: key time_offset: expected 0, as there is no place for another one, got {content['time_offset']}; "
+            "set it to 0 here, and give the time offset to Imu"
+        )
     rate_key = "rate_hz" if "rate_hz" in content else "update_rate"
     densities = {name: _number(path, content, name, zero_too=True) / inflation for name in _DENSITIES}
     rate = _number(path, content, rate_key)
@@ -140,13 +145,15 @@ def write_imu_parameters(
         ]
     for name in _DENSITIES:
         x = torch.as_tensor(getattr(noise, name), dtype=torch.float64).detach()
-        if x.ndim > 0 and not (x == x.flatten()[0]).all():
+        if x.numel() == 0 or not (x == x.flatten()[0]).all():
             raise ValueError(f"parameters: such a file holds one {name} for all axes, got {x.tolist()}")
         lines.append(f"{name}: {_float(float(x.flatten()[0]) * inflation)}  # {_UNITS[name]}")
     if format == "kalibr":
         if parameters.topic is not None:
             lines.append(f"rostopic: {_text(parameters.topic)}")
         lines.append(f"update_rate: {float(parameters.rate)!r}  # Hz")
+    if path.is_dir():
+        raise ValueError(f"{path}: expected a file, got a folder")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -157,7 +164,9 @@ def _float(x: float) -> str:
 
 
 def _text(x: str) -> str:
-    return importlib.import_module("yaml").safe_dump(x).split("\n")[0]
+    # In quotes, where what would break the line is escaped.
+    text: str = importlib.import_module("yaml").safe_dump(x, default_style='"', width=math.inf)
+    return text.rstrip("\n")
 
 
 def _path(path: str | PathLike[str]) -> Path:
@@ -166,7 +175,7 @@ def _path(path: str | PathLike[str]) -> Path:
     return Path(path)
 
 
-def _number(path: Path, content: Mapping[str, Any], key: str, zero_too: bool = False) -> float:
+def _finite(path: Path, content: Mapping[str, Any], key: str) -> float:
     if key not in content:
         raise ValueError(
             f"{path}: key {key} is missing; expected a number; there are {short(', '.join(map(str, content)))}"
@@ -178,7 +187,14 @@ def _number(path: Path, content: Mapping[str, Any], key: str, zero_too: bool = F
         value = float(x)  # YAML 1.1 takes 1e-3 for text
     except (TypeError, ValueError):
         raise ValueError(f"{path}: key {key}: expected a number, got {short(repr(x))}") from None
-    if not math.isfinite(value) or value < 0 or (value == 0 and not zero_too):
+    if not math.isfinite(value):
+        raise ValueError(f"{path}: key {key}: expected a finite number, got {value}")
+    return value
+
+
+def _number(path: Path, content: Mapping[str, Any], key: str, zero_too: bool = False) -> float:
+    value = _finite(path, content, key)
+    if value < 0 or (value == 0 and not zero_too):
         least = "of at least zero" if zero_too else "above zero"
         raise ValueError(f"{path}: key {key}: expected a finite number {least}, got {value}")
     return value

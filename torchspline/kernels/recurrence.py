@@ -31,16 +31,17 @@ def linear_recurrence(factors, x, y, samples, channels, by_row, by_sample, by_ch
                 y[at + c] = x[at + c] + factors[factor + c * by_channel] * y[at + c - channels]
 """
 
-# Products stay of unit length by one step of Newton's method each, which needs neither root nor division.
+# Products stay of unit length by one step of Newton's method each, which needs neither root nor division. They are kept
+# in double precision: steps of slow rates are not much above what rounds off a quaternion in single precision.
 _ROTATIONS = """\
 from numba import njit
 
 
 @njit("{signature}", nogil=True, cache={cache}, error_model="numpy")
-def rotation_products(start, steps, products, half, samples, begin, stop):
+def rotation_products(start, steps, products, samples, begin, stop):
     for row in range(begin, stop):
-        w, x, y, z = start[4 * row], start[4 * row + 1], start[4 * row + 2], start[4 * row + 3]
-        at, to = row * samples * 4, row * (samples + 1) * 4
+        first, at, to = row * 4, row * samples * 4, row * (samples + 1) * 4
+        w, x, y, z = float(start[first]), float(start[first + 1]), float(start[first + 2]), float(start[first + 3])
         products[to], products[to + 1], products[to + 2], products[to + 3] = w, x, y, z
         for i in range(samples):
             a, b, c, d = steps[at], steps[at + 1], steps[at + 2], steps[at + 3]
@@ -48,7 +49,7 @@ def rotation_products(start, steps, products, half, samples, begin, stop):
             q = w * b + x * a + y * d - z * c
             r = w * c - x * d + y * a + z * b
             s = w * d + x * c - y * b + z * a
-            scale = half + half + half - half * (p * p + q * q + r * r + s * s)
+            scale = 1.5 - 0.5 * (p * p + q * q + r * r + s * s)
             w, x, y, z = scale * p, scale * q, scale * r, scale * s
             at += 4
             to += 4
@@ -82,7 +83,7 @@ def linear_recurrence(factors: Array, x: Array) -> Array:
 @cache
 def _rotations(real: str) -> Callable[..., None]:
     arrays = ", ".join([f"{real}[::1]"] * 3)
-    return compiled("rotation_products", _ROTATIONS, f"({arrays}, {real}{', int64' * 3})")
+    return compiled("rotation_products", _ROTATIONS, f"({arrays}{', int64' * 3})")
 
 
 def rotation_products(start: Array, steps: Array) -> Array:
@@ -94,8 +95,7 @@ def rotation_products(start: Array, steps: Array) -> Array:
     rows, samples, _ = steps.shape
     products = np.empty((rows, samples + 1, 4), steps.dtype)
     kernel = _rotations(steps.dtype.name)
-    half = steps.dtype.type(0.5)
-    arguments = (start.reshape(-1), steps.reshape(-1), products.reshape(-1), half, samples)
+    arguments = (start.reshape(-1), steps.reshape(-1), products.reshape(-1), samples)
     parts = torch.get_num_threads() if steps.size >= SERIAL_BELOW else 1
     run([partial(kernel, *arguments, begin, stop) for begin, stop in spans(rows, parts, 1)])
     return products

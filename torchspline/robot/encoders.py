@@ -83,7 +83,7 @@ def fit_joints(
         order: of the spline, 4 or more, so that accelerations are continuous.
         position_sigma, velocity_sigma: standard deviations, a number or (dof,).
         estimate_delay: find for each joint how much later its velocities are than its positions, as filters of drives
-            make them.
+            make them; zero for one that is hardly accelerated.
     Returns:
         JointFit, on the CPU in float64; `fit.Problem(result.trajectory)` takes it from there if more is known.
     Raises:
@@ -117,7 +117,7 @@ def fit_joints(
     data = []
     for r, (values, sigma) in enumerate(zip(numbers, given, strict=False)):
         if sigma is None:
-            sigma, spacing = _noise(times, values, order - r)
+            sigma, spacing = _noise(times, values, order - r, numbers[0])
             what = ("positions", "velocities")[r]
             notes.append(f"noise of {what} from a fit of these alone, knots {spacing * 1e3:.3g} ms apart")
         data.append(_Data(r, values, sigma))
@@ -223,8 +223,9 @@ def _delays(knots: Knots, times: Tensor, data: list[_Data]) -> Array:
         pull = _evaluate(knots, points, _rows(knots, times, 2))
         there = ~np.isnan(rest)
         power = np.where(there, pull**2, 0.0).sum(0)
-        # A joint that is not accelerated says nothing.
-        step = -np.where(there, pull * rest, 0.0).sum(0) / np.where(power > 0, power, np.inf)
+        # A joint that is hardly accelerated, so that its delay is not known to a knot interval, says nothing.
+        told = power > (velocities.sigma / knots.seconds) ** 2
+        step = -np.where(there, pull * rest, 0.0).sum(0) / np.where(told, power, np.inf)
         late = np.clip(late + step, -2.0 * knots.seconds, 2.0 * knots.seconds)
         if np.abs(step).max() < 1e-8:
             break
@@ -264,7 +265,7 @@ def _choose(times: Tensor, data: Sequence[_Data], order: int) -> float:
     return best
 
 
-def _noise(times: Tensor, values: Array, order: int) -> tuple[Array, float]:
+def _noise(times: Tensor, values: Array, order: int, positions: Array) -> tuple[Array, float]:
     """Standard deviation of each column about a spline of its own, (dof,), and that spline's spacing."""
     data = [_Data(0, values, np.ones(values.shape[1]))]
     spacing = _choose(times, data, order)
@@ -272,7 +273,8 @@ def _noise(times: Tensor, values: Array, order: int) -> tuple[Array, float]:
     _, left = _solve(knots, times, data)
     free = max(len(times) - knots.count, 1)
     # A column that is constant has no noise to see; it must not count for everything.
-    least = 1e-9 * max(float(np.abs(values).max()), 1e-9)
+    # Velocities that are all zero are seen beside the positions of the same log.
+    least = 1e-9 * max(float(np.abs(values).max()), 1e-3 * float(np.abs(positions).max()), 1e-9)
     return np.sqrt(left / free).clip(least), spacing
 
 

@@ -6,6 +6,7 @@ themselves, and turns MJCF bodies about their origin wherever the joint is.
 """
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 _NONE = math.inf
+#: What says in which encoding XML is.
+_DECLARED = re.compile(r"""^(<\?xml[^>]*?)\s+encoding\s*=\s*(?:"[^"]*"|'[^']*')""")
 
 
 class Joint(NamedTuple):
@@ -71,18 +74,22 @@ def screw(
     return np.concatenate([np.cross(anchor, unit), unit])
 
 
-def content(source: str | PathLike[str]) -> tuple[str, str]:
-    """What errors call it, and the text: `source` itself if it is XML, else the file of that name."""
-    if isinstance(source, str) and source.lstrip().startswith("<"):
-        return "source", source
+def content(source: str | PathLike[str]) -> tuple[str, bytes]:
+    """What errors call it, and the bytes: of `source` itself if it is XML, else of the file of that name.
+
+    Which encoding they are in is for the parser to find out: a file may declare one. Text is past that.
+    """
+    if isinstance(source, str) and (text := source.lstrip("\ufeff \t\r\n")).startswith("<"):
+        return "source", _DECLARED.sub(r"\1", text, count=1).encode()
     if not isinstance(source, (str, PathLike)):
         raise TypeError(f"source: expected XML text or the path of a file, got {type(source).__name__}")
     path = Path(source)
-    if not path.is_file():
+    if not str(source) or not path.is_file():
+        came = str(source) if len(str(source)) <= 200 else str(source)[:197] + "..."
         raise FileNotFoundError(
-            f"source: expected XML text or the path of a file, got {str(path)!r}: no such file"
+            f"source: expected XML text or the path of a file, got {came!r}: no such file"
         )
-    return str(path), path.read_text(encoding="utf-8", errors="replace")
+    return str(path), path.read_bytes()
 
 
 @contextmanager
@@ -107,8 +114,7 @@ def from_urdf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
 
     name, text = content(source)
     try:
-        # As bytes: lxml refuses text that declares an encoding.
-        robot = URDF.from_xml_string(text.encode())
+        robot = URDF.from_xml_string(text)
     except Exception as reason:  # the parser raises whatever comes, assertions included
         raise ValueError(
             f"source: expected a URDF robot in {name}, got one that cannot be read: {reason}"
@@ -118,6 +124,9 @@ def from_urdf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
 
 def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
     links = [link.name for link in robot.links]
+    if len(set(links)) < len(links):
+        twice = next(name for name in links if links.count(name) > 1)
+        raise ValueError(f"source: expected links of different names, got two called {twice!r}")
     children: dict[str, list[Any]] = {}
     parent_of: dict[str, str] = {}
     for joint in robot.joints:
@@ -144,7 +153,12 @@ def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
             if driver == joint.name:
                 joints.append(own)
             move = (Move(driver, _urdf_screw(joint), factor, offset),)
-        frames.append(Frame(joint.child, joint.parent, _origin(joint.origin), move))
+        pose = _origin(joint.origin)
+        if not np.isfinite(pose).all():
+            raise ValueError(
+                f"source: joint {joint.name!r} has an origin that is not finite; expected numbers"
+            )
+        frames.append(Frame(joint.child, joint.parent, pose, move))
         stack += reversed(children.get(joint.child, []))
     if len(frames) != len(links):
         left = sorted(set(links) - {frame.name for frame in frames})
@@ -161,13 +175,21 @@ def _urdf_joint(joint: Any) -> Joint:
     if limit is None:
         return Joint(joint.name, joint.type)
     bounds = (-_NONE, _NONE) if joint.type == "continuous" else (limit.lower or 0.0, limit.upper or 0.0)
-    most = (_NONE if x is None else float(x) for x in (limit.velocity, limit.effort))
+    if not bounds[0] <= bounds[1]:
+        raise ValueError(
+            f"source: joint {joint.name!r} has limits from {bounds[0]} to {bounds[1]}; expected lower <= upper"
+        )
+    most = [_NONE if x is None else float(x) for x in (limit.velocity, limit.effort)]
+    if not all(x >= 0 for x in most):
+        raise ValueError(
+            f"source: joint {joint.name!r} has limits of velocity and effort {most}; expected numbers of at least zero"
+        )
     return Joint(joint.name, joint.type, *map(float, bounds), *most)
 
 
 def _urdf_screw(joint: Any) -> Array:
     axis = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
-    if not np.linalg.norm(axis) > 0:
+    if not 0 < np.linalg.norm(axis) < math.inf:
         raise ValueError(f"source: joint {joint.name!r} has the axis {axis}; expected a direction")
     return screw(joint.type, axis)
 
@@ -183,6 +205,10 @@ def _mimicked(joints: Sequence[Any]) -> dict[str, tuple[str, float, float]]:
             rate = 1.0 if rule.multiplier is None else float(rule.multiplier)
             offset += factor * (rule.offset or 0.0)
             factor *= rate
+            if not math.isfinite(factor) or not math.isfinite(offset):
+                raise ValueError(
+                    f"source: joint {name!r} mimics with factor {factor} and offset {offset}; expected finite numbers"
+                )
             if rule.joint not in own or own[rule.joint].type == "fixed" or rule.joint in seen:
                 raise ValueError(
                     f"source: joint {name!r} mimics {rule.joint!r}; expected another joint that moves by itself"
@@ -215,7 +241,7 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
         raise ImportError("MJCF files need MuJoCo's parser: pip install 'torchspline[mjcf]'") from None
     name, text = content(source)
     try:
-        model = mujoco.MjModel.from_xml_string(text)
+        model = mujoco.MjModel.from_xml_string(text.decode(errors="replace"))
     except ValueError as reason:
         raise ValueError(
             f"source: expected an MJCF model in {name}, got one that cannot be read: {reason}"

@@ -49,6 +49,11 @@ def on_link(
         measured_signs = se3.sign_blocks if kind.rows is None and kind_measured == 7 else kind.measured_signs
         compiled = False
 
+        def __reduce__(self) -> tuple[Any, ...]:
+            # The class has no place in a module from which pickle could take it.
+            made_of = (kind, link, dof, pose, screws, index, factor, offset)
+            return _blank, made_of, self.__dict__
+
         @classmethod
         def check_group(cls, group: Group) -> None:
             if group.name != f"R{dof}":
@@ -88,3 +93,9 @@ def on_link(
         f"{kind.__name__}On_{''.join(c if c.isalnum() else '_' for c in link)}"
     )
     return OnLink
+
+
+def _blank(*made_of: Any) -> Residual:
+    """One without contents, for pickle."""
+    kind = on_link(*made_of)
+    return kind.__new__(kind)

@@ -56,6 +56,13 @@ def bspline(
     there, nor where neighbours are exactly pi apart.
     Raises:
         TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
+    Examples:
+        >>> import torch
+        >>> from torchspline import SO3
+        >>> t = torch.tensor([0.0, 0.25, 0.5], dtype=torch.float64)
+        >>> state = bspline(SO3.random(8, dtype=torch.float64), t, group=SO3, order=4, dt=0.1)
+        >>> state.value.shape, state.velocity.shape, state.jerk
+        (torch.Size([3, 4]), torch.Size([3, 3]), None)
     """
     group = _as_group(group)
     _check_control_points(control_points, group, order)
@@ -214,6 +221,14 @@ class BSpline(Trajectory):
         dt, t0: seconds, kept in float64 through `.to(dtype)`; tensors that require grad are used as given.
         dt_ns, t0_ns: whole nanoseconds instead; times are then int64.
         learnable: whether control points that do not require grad become a `Parameter`.
+    Examples:
+        >>> import torch
+        >>> from torchspline import SE3
+        >>> spline = BSpline(SE3.identity(12, dtype=torch.float64), group=SE3, order=4, dt=0.1)
+        >>> spline
+        BSpline(SE3, order=4, batch=(), points=12, domain=[0.0, 0.9] s)
+        >>> spline(torch.tensor(0.4)).tolist()
+        [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     """
 
     _times = ("dt", "t0")

@@ -223,6 +223,15 @@ def hermite(
     jump at knots.
     Raises:
         TypeError: wrong type or dtype. ValueError: wrong shape, device or value, or a time outside the domain.
+    Examples:
+        >>> import torch
+        >>> from torchspline import R3
+        >>> zero = torch.zeros(2, 3, dtype=torch.float64)
+        >>> ends = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+        >>> times = torch.tensor([0.0, 2.0], dtype=torch.float64)
+        >>> middle = torch.tensor(1.0, dtype=torch.float64)
+        >>> hermite(ends, zero, zero, middle, group=R3, times=times).value.tolist()  # at rest at both ends
+        [0.5, 0.0, 0.0]
     """
     checks.instance("group", group, Group, "a torchspline.Group such as torchspline.SE3")
     _check_knots(values, velocities, accelerations, times, group, coordinates, frame, validate)

@@ -40,6 +40,13 @@ def phantom_points(keyframes: Tensor, group: Group, order: int = 4) -> Tensor:
         `(*batch, M + 2 ceil((order - 2) / 2), P)`. An even order then spans M - 1 knot intervals from keyframe to
         keyframe, an odd one M.
     Differentiable in keyframes, to any order.
+    Examples:
+        >>> import torch
+        >>> from torchspline import R3, BSpline
+        >>> keys = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.0, 1, 0]], dtype=torch.float64)
+        >>> spline = BSpline(phantom_points(keys, R3), group=R3, order=4, dt=1.0)
+        >>> spline.domain, spline(torch.tensor(2.0)).tolist()
+        ((0.0, 2.0), [1.0, 1.0, 0.0])
     """
     _check_group(group)
     checks.whole("order", order, least=2)

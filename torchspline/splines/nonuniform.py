@@ -70,7 +70,9 @@ def cumulative_basis(local: Vector, u: Scalar) -> list[Scalar]:
 
 def cumulative_weights(local: Tensor, u: Tensor, derivatives: int) -> Tensor:
     """The same and its derivatives by u: `(*B, derivatives + 1, k - 1)` of local knots (*B, 2 (k - 1)) and u (*B)."""
-    sums = tuple(cumulative_basis(split(local), jet.variable(u, derivatives)))
+    # Constants as jets too: the tracer of torch.compile knows no operation of a tensor with one.
+    constants = tuple(jet.constant(x, derivatives) for x in split(local))
+    sums = tuple(cumulative_basis(constants, jet.variable(u, derivatives)))
     like = u.unsqueeze(-1)
     return torch.stack([join(jet.values(sums, r), like) for r in range(derivatives + 1)], dim=-2)
 

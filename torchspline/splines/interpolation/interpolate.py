@@ -61,6 +61,14 @@ def interpolate(
     Raises:
         TypeError: wrong type or dtype. ValueError: an unknown method or option, a wrong shape, device or value, or a
             time outside the domain.
+    Examples:
+        >>> import torch
+        >>> from torchspline import SO3
+        >>> keys = SO3.exp(torch.tensor([[0.0, 0, 0], [0, 0, 1.0], [0, 0, 1.4]], dtype=torch.float64))
+        >>> times = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+        >>> halfway = interpolate("SLERP", keys, times, torch.tensor([0.5, 1.5], dtype=torch.float64)).value
+        >>> [round(angle, 3) for angle in SO3.log(halfway)[:, 2].tolist()]
+        [0.5, 1.2]
     """
     scheme, of, options = _resolve(method, keyframes, group, options)
     _check_keys(scheme, keyframes, times, of, way, validate)

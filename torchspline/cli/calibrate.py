@@ -1,7 +1,7 @@
-"""The command `torchspline calibrate camera-imu`."""
+"""`torchspline calibrate camera-imu`."""
 
+import json
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -11,6 +11,12 @@ from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.reading import read_recording
 from torchspline.calibrate.results import FILES, write_calibration
 from torchspline.calibrate.start import find_start
+from torchspline.cli.report import Report
+
+EXAMPLES = """
+torchspline calibrate camera-imu --imu imu.csv --corners cam0.npz cam1.npz --config config.yaml --out DIR
+torchspline calibrate camera-imu --imu a.csv b.csv --corners cam0.npz --config config.yaml --estimate-intrinsics
+"""
 
 
 def camera_imu(
@@ -32,7 +38,7 @@ def camera_imu(
     max_offset: float = 10.0,
     start: float = 0.0,
     duration: float = math.inf,
-) -> int:
+) -> Report:
     """Where cameras sit on an IMU, and how their clocks differ, from a recording of a board: no guess needed.
 
     Args:
@@ -88,63 +94,20 @@ def camera_imu(
     seconds = {**found.seconds, "start": found_after, "total": found_after + found.seconds["total"]}
     found = replace(found, seconds=seconds)
     warnings = write_calibration(out, found)
-    _show(found, warnings)
-    print(f"written to {out}: {' '.join(FILES)}")
-    return 0
+    notes = [*found.notes, *(f"warning: {warning}" for warning in warnings)]
+    values = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    files = [out / name for name in FILES]
+    columns = ("", "estimate", "standard deviation", "unit")
+    return Report("camera-IMU calibration", values, rows(found), notes, files, columns=columns)
 
 
-#: What the first words of the command line are.
-COMMAND = ("calibrate", "camera-imu")
-_FILES = {"imu": "csv file of each IMU", "corners": "npz file of each camera, in the order of the cameras"}
-_SWITCHES = {
-    "--estimate_intrinsics",
-    "--estimate_line_delay",
-    "--estimate_imu_scaling",
-    "--synchronised",
-    "--reweigh",
-}
-
-
-def run(arguments: Sequence[str]) -> int:
-    """Run the command with what follows its words on the command line.
-
-    A parser of its own: the one for all commands takes `--config` for itself and lists in brackets only.
-    """
-    from jsonargparse import ArgumentParser
-
-    parser = ArgumentParser(
-        prog=f"torchspline {' '.join(COMMAND)}", description=(camera_imu.__doc__ or "").split("\n")[0]
-    )
-    for name, words in _FILES.items():
-        parser.add_argument(f"--{name}", type=Path, nargs="+", required=True, metavar="FILE", help=words)
-    parser.add_function_arguments(camera_imu, as_group=False, skip=set(_FILES))
-    return camera_imu(**parser.parse_args(_spelled_out(arguments)).as_dict())
-
-
-def _spelled_out(arguments: Sequence[str]) -> list[str]:
-    """Underscores for hyphens in names of options, and `true` behind switches that stand alone."""
-    result = []
-    for i, word in enumerate(arguments):
-        option, equals, value = word.partition("=")
-        if not option.startswith("--"):
-            result.append(word)
-            continue
-        option = "--" + option[2:].replace("-", "_")
-        alone = not equals and (i + 1 == len(arguments) or arguments[i + 1].startswith("--"))
-        result.append(f"{option}=true" if alone and option in _SWITCHES else f"{option}{equals}{value}")
-    return result
-
-
-def _show(found: Calibration, warnings: list[str]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    table = Table("", "estimate", "standard deviation", "unit", title="camera-IMU calibration")
+def rows(found: Calibration) -> list[tuple[str, ...]]:
+    """Estimates with standard deviations, and residuals: rows of the table."""
+    made: list[tuple[str, ...]] = []
 
     def add(name: str, value: list[float], sigma: list[float] | None, unit: str, digits: int) -> None:
         deviations = "" if sigma is None else " ".join(f"{x:.2g}" for x in sigma)
-        table.add_row(name, " ".join(f"{x:+.{digits}f}" for x in value), deviations, unit)
+        made.append((name, " ".join(f"{x:+.{digits}f}" for x in value), deviations, unit))
 
     for i, camera in enumerate(found.cameras):
         pose, sigma = camera.T_imu_cam.tolist(), camera.T_imu_cam_sigma.tolist()
@@ -168,14 +131,10 @@ def _show(found: Calibration, warnings: list[str]) -> None:
                 add(f"{name} of {imu.name}", value.tolist(), deviations.tolist(), unit, 5)
     add("gravity on the board", found.gravity.tolist(), None, "m/s²", 4)
     for camera in found.cameras:
-        table.add_row(f"{camera.name}: median error", f"{camera.residuals.median_length:.3f}", "", "px")
+        made.append((f"{camera.name}: median error", f"{camera.residuals.median_length:.3f}", "", "px"))
     for imu in found.imus:
         for residuals in (imu.gyroscope, imu.accelerometer):
             rms = float(residuals.values.square().mean().sqrt())
-            table.add_row(f"{residuals.name}: RMS of an axis", f"{rms:.4f}", "", residuals.unit)
-    table.add_row("time from nothing to result", f"{found.seconds['total']:.2f}", "", "s")
-    console.print(table)
-    for note in found.notes:
-        console.print(f"note: {note}", markup=False)
-    for warning in warnings:
-        console.print(f"warning: {warning}", markup=False)
+            made.append((f"{residuals.name}: RMS of an axis", f"{rms:.4f}", "", residuals.unit))
+    made.append(("time from nothing to result", f"{found.seconds['total']:.2f}", "", "s"))
+    return made

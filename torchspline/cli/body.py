@@ -6,16 +6,18 @@ import re
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
+from torchspline.cli.common import NS
+from torchspline.cli.report import Report
 from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, read_bvh, write_imu
 from torchspline.people import fit_body, response
 from torchspline.plot import imu_comparison
 
-_NS = 1_000_000_000
-_console = Console()
+EXAMPLES = """
+torchspline body walk.bvh --rate 200 --out DIR
+torchspline body walk.bvh --unit 0.0254 --gravity "[0, 0, -9.80665]"  # inches, z up
+"""
 
 
 def body(
@@ -26,7 +28,7 @@ def body(
     unit: float = 0.01,
     gravity: tuple[float, float, float] = (0.0, -9.80665, 0.0),
     margin: float = 0.2,
-) -> int:
+) -> Report:
     """IMU readings on every joint of a BVH file, one EuRoC file a joint.
 
     Args:
@@ -57,29 +59,29 @@ def body(
         made = measure(fitted, times, gravity)
     kept = response(torch.tensor([0.5 * bandwidth, bandwidth]).double(), frames, bandwidth=bandwidth)
     out.mkdir(parents=True, exist_ok=True)
-    stamps = (times * _NS).round().to(torch.int64)
-    table = Table(
-        "joint", "gyroscope, RMS [rad/s]", "accelerometer, RMS [m/s²]", "file", title=f"IMUs on {motion.name}"
-    )
+    stamps = (times * NS).round().to(torch.int64)
+    rows = []
     report = {}
     for j, name in enumerate(skeleton.names):
         reading = ImuReading(made.gyroscope[j], made.accelerometer[j])
         rms = [float(x.square().sum(-1).mean().sqrt()) for x in reading]
         file = f"imu_{j:02d}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}.csv"
         write_imu(out / file, ImuRecord(stamps, *reading, name))
-        table.add_row(name, f"{rms[0]:.3f}", f"{rms[1]:.3f}", file)
+        rows.append((f"{name}: RMS", f"{rms[0]:.3f} / {rms[1]:.3f}", "rad/s / m/s²"))
         report[name] = {"file": file, "gyroscope_rms_rad_s": rms[0], "accelerometer_rms_m_s2": rms[1]}
     first = ImuReading(made.gyroscope[0], made.accelerometer[0])
-    imu_comparison(out / "imu.png", (times, first), title=f"{motion.name}: IMU on {skeleton.names[0]}")
+    figure = imu_comparison((times, first), title=f"{motion.name}: IMU on {skeleton.names[0]}")
+    figure.savefig(out / "imu.png", dpi=130)
     summary = {
         "frames": len(t), "frame_rate_hz": frames, "bandwidth_hz": bandwidth, "rate_hz": rate,
         "acceleration_kept_at_half_and_full_bandwidth": kept.gain.tolist(), "joints": report,
     }  # fmt: skip
     (out / "report.json").write_text(json.dumps(summary, indent=2) + "\n")
-    _console.print(table)
-    _console.print(
+    notes = [
         f"{len(t)} frames at {frames:.4g} Hz, {len(times)} readings a joint at {rate:g} Hz; of accelerations at "
         f"{bandwidth:g} Hz {100 * float(kept.gain[1]):.1f} % are kept"
+    ]
+    files = [out / str(joint["file"]) for joint in report.values()]
+    return Report(
+        f"IMUs on {motion.name}", summary, rows, notes, [*files, out / "imu.png", out / "report.json"]
     )
-    _console.print(f"written to {out}: {len(report)} files imu_*.csv, imu.png report.json")
-    return 0

@@ -1,0 +1,110 @@
+"""The command line. `COMMANDS` lists the commands; a new one is a module beside this one and a line in it."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NamedTuple
+
+from torchspline.cli.arguments import Mistake, parse
+from torchspline.cli.report import Report
+
+
+class Command(NamedTuple):
+    """Where a command is, and what it is for."""
+
+    #: Module that holds the function and, if there are any, `EXAMPLES` for its help.
+    module: str
+    function: str
+    summary: str
+
+
+_HERE = "torchspline.cli"
+COMMANDS: dict[str, Command] = {
+    "demo": Command(
+        f"{_HERE}.demo", "demo", "a known motion, noisy poses of it, a fit, its IMU signal, checked"
+    ),
+    "fit": Command(f"{_HERE}.fit", "fit", "a spline through a file of poses"),
+    "imu": Command(f"{_HERE}.imu", "imu", "IMU readings from a file of poses, compared with a recording"),
+    "body": Command(f"{_HERE}.body", "body", "IMU readings on every joint of a captured motion (BVH)"),
+    "generate": Command(
+        f"{_HERE}.generate", "generate", "random motions and IMUs on them, as data to train on"
+    ),
+    "calibrate camera-imu": Command(
+        f"{_HERE}.calibrate", "camera_imu", "where cameras sit on an IMU, from images of a board"
+    ),
+    "bench": Command(f"{_HERE}.bench", "bench", "how long the main calls take on this machine"),
+    "view": Command(f"{_HERE}.view", "view", "a page with an interactive 3D view of a file"),
+    "explore": Command(f"{_HERE}.explore", "explore", "compare interpolation methods in the browser"),
+    "convert": Command(f"{_HERE}.convert", "convert", "between file formats of poses"),
+    "info": Command(f"{_HERE}.info", "info", "what is in a file"),
+    "kernels show": Command(f"{_HERE}.kernels", "show", "the source of a compiled loop"),
+}
+_EXPECTED = (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `torchspline` command. Exits with 0, with 1 if a check failed, with 2 on bad input."""
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(words: Sequence[str]) -> int:
+    """Run the command that `words` say and return its exit status."""
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if words else 2
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("torchspline"))
+        return 0
+    name = next((x for x in (" ".join(words[:2]), words[0]) if x in COMMANDS), None)
+    if name is None:
+        inner = [x for x in COMMANDS if x.split()[0] == words[0]]
+        if inner and words[1:2] in ([], ["-h"], ["--help"]):
+            print(_overview(inner))
+            return 0 if words[1:] else 2
+        return _refuse(
+            f"{' '.join(words[:2])!r} is no command; expected one of {', '.join(inner or COMMANDS)}"
+        )
+    command = COMMANDS[name]
+    try:
+        module = import_module(command.module)
+        call, as_json = parse(
+            f"torchspline {name}", getattr(module, command.function), words[len(name.split()) :],
+            getattr(module, "EXAMPLES", ""),
+        )  # fmt: skip
+        found = call()
+        if not isinstance(found, Report):
+            return int(found)
+        found.print_json(name) if as_json else found.print()
+        return 0 if found.passed else 1
+    except Mistake as mistake:
+        return _refuse(f"{mistake} (torchspline {name} --help says more)")
+    except _EXPECTED as error:
+        return _refuse(str(error) or type(error).__name__)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        return 0
+
+
+def _refuse(message: str) -> int:
+    print(f"torchspline: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _overview(names: Sequence[str] = tuple(COMMANDS)) -> str:
+    width = max(map(len, names)) + 2
+    lines = [f"  {name:<{width}}{COMMANDS[name].summary}" for name in names]
+    return "\n".join(
+        [
+            "usage: torchspline COMMAND ...",
+            "",
+            "Continuous-time motion: splines on Lie groups.",
+            "",
+            *lines,
+            "",
+            "torchspline COMMAND --help shows arguments and examples; --json makes a command print one line of JSON.",
+            "Exit status: 0 all is well, 1 a check failed, 2 bad input.",
+        ]
+    )

@@ -1,0 +1,3 @@
+from torchspline.cli import main
+
+main()

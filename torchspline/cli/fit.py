@@ -1,0 +1,68 @@
+"""`torchspline fit`."""
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from torchspline.cli.common import NS, fit_report, fit_rows
+from torchspline.cli.files import PoseFormat, fitted, named_after, open_poses
+from torchspline.cli.report import Report
+from torchspline.io import save_trajectory
+
+EXAMPLES = """
+torchspline fit poses.txt                           # writes poses.npz
+torchspline fit mocap0 --spacing 80 --out motion.npz --figure residuals.png
+python -c "from torchspline.io import load_trajectory; print(load_trajectory('motion.npz').domain)"
+"""
+
+
+def fit(
+    poses: Path,
+    out: Path | None = None,
+    spacing: float | Literal["auto"] = "auto",
+    order: int = 6,
+    representation: Literal["split", "joint"] = "split",
+    gap: float | None = None,
+    start: float = 0.0,
+    duration: float = math.inf,
+    format: PoseFormat | None = None,
+    times: Path | None = None,
+    topic: str | None = None,
+    figure: Path | None = None,
+) -> Report:
+    """A spline through a file of poses, by least squares; saved as a trajectory file.
+
+    Args:
+        poses: TUM, EuRoC, KITTI or nerfstudio file, gzipped or not, or ROS bag.
+        out: trajectory file, for torchspline.io.load_trajectory; by default named after the poses, in this folder.
+        spacing: of the knots, ms; auto finds one from the data and says why.
+        order: of the spline; the curve has order - 2 continuous derivatives.
+        representation: split (R3 x SO3) or joint (SE3).
+        gap: the longest stretch without poses that is bridged, ms; by default 30, or three median pose intervals
+            if that is more. The longest stretch without a larger gap is used.
+        start: offset into that stretch, s.
+        duration: how much of it to use, s.
+        format: of the poses; by default recognised from their content.
+        times: file of times that goes with KITTI poses.
+        topic: of a ROS bag.
+        figure: where to draw the residuals (png, pdf, svg).
+    """
+    record = open_poses(poses, format, times, topic)
+    used, found = fitted(record, spacing, order, representation, gap, start, duration)
+    target = out or named_after(poses, ".npz")
+    if target.resolve() == poses.resolve():
+        raise ValueError(f"out: expected another file than the poses, got {target}")
+    save_trajectory(target, found.trajectory)
+    files = [target]
+    if figure is not None:
+        from torchspline.plot import residuals
+
+        residuals(found, used.time_ns, title=poses.name).savefig(figure, dpi=130)
+        files.append(figure)
+    dt_ns = found.trajectory.dt_ns
+    assert dt_ns is not None  # the stamps are in nanoseconds
+    dt, span = dt_ns / NS, (int(used.time_ns[-1]) - int(used.time_ns[0])) / NS
+    rows = [("poses used", f"{len(used)} of {len(record)} over {span:.2f} s", ""), *fit_rows(found, dt)]
+    values = {"poses_used": len(used), "duration_s": span, **fit_report(found, dt)}
+    values.pop("notes")
+    return Report(f"spline through {poses.name}", values, rows, found.notes, files)
