@@ -255,7 +255,7 @@ def _is_complete(path: Path, manifest: dict[str, Any], shard: int) -> bool:
     library = pyarrow()
     try:
         found = library.parquet.read_metadata(path)
-    except (library.ArrowInvalid, OSError):
+    except (library.ArrowException, OSError, ValueError):  # names that are no text, too
         return False
     metadata = found.metadata or {}
     if (metadata.get(_DATASET), metadata.get(_SHARD)) != (_digest(manifest), str(shard).encode()):
