@@ -102,7 +102,7 @@ def naming(source: str | PathLike[str]) -> Iterator[None]:
         is_text = isinstance(source, str) and source.lstrip().startswith("<")
         if not is_text and str(source) not in text:
             text = text.replace("source: ", f"source: {source}: ", 1)
-        raise ValueError(text) from None
+        raise ValueError(text if len(text) <= 500 else f"{text[:497]}...") from None
 
 
 # ---------------------------------------------------------------------- URDF
