@@ -137,7 +137,7 @@ def _section(path: Path, content: Mapping[str, Any], kind: str, i: int, parse: A
     try:
         return parse(section, name)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {name}: {error}") from None
+        raise ValueError(f"{path}: {name}: {short(error, 500)}") from None
 
 
 def _noise(section: Mapping[str, Any], name: str) -> ImuNoise:

@@ -13,6 +13,7 @@ from torchspline import checks
 from torchspline.groups.group import SE3
 from torchspline.io.camera import Camera, camera_from
 from torchspline.io.sections import number, numbered, read_sections, section_of
+from torchspline.io.yaml import short
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ def read_camchain(path: str | PathLike[str]) -> CamChain:
     names = numbered(content, "cam")
     if not names:
         raise ValueError(
-            f"{path}: expected sections cam0, cam1, ..., got only {', '.join(map(str, content)) or 'none'}"
+            f"{path}: expected sections cam0, cam1, ..., got only {short(', '.join(map(str, content))) or 'none'}"
         )
     cameras, poses, offsets = [], [], []
     for name in names:
@@ -76,8 +77,8 @@ def read_camchain(path: str | PathLike[str]) -> CamChain:
                 )
             poses.append(SE3.inverse(SE3.from_matrix(_matrix("T_cam_imu", section["T_cam_imu"]))))
             offsets.append(number("timeshift_cam_imu", section.get("timeshift_cam_imu", 0.0)))
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}: {name}: {error}") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{path}: {short(name, 40)}: {short(error, 500)}") from None
     return CamChain(tuple(cameras), torch.stack(poses), torch.tensor(offsets, dtype=torch.float64))
 
 

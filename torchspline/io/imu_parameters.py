@@ -185,7 +185,7 @@ def _finite(path: Path, content: Mapping[str, Any], key: str) -> float:
         if isinstance(x, bool):
             raise TypeError
         value = float(x)  # YAML 1.1 takes 1e-3 for text
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{path}: key {key}: expected a number, got {short(repr(x))}") from None
     if not math.isfinite(value):
         raise ValueError(f"{path}: key {key}: expected a finite number, got {value}")
@@ -213,7 +213,7 @@ def _matrix_of(path: Path, x: Any) -> Tensor:
 def _matrix(path: Path, key: str, x: Any, size: int) -> Tensor:
     try:
         rows = [[float(y) for y in row] for row in x]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rows = []
     if len(rows) != size or any(len(row) != size for row in rows):
         raise ValueError(f"{path}: key {key}: expected {size} x {size} numbers, got {short(repr(x))}")

@@ -48,5 +48,5 @@ def number(name: str, x: Any) -> float:
         if not isinstance(x, (int, float, str)) or isinstance(x, bool):
             raise ValueError
         return float(x)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise ValueError(f"{name}: expected a number, got {short(repr(x))}") from None
