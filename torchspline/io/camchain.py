@@ -79,7 +79,10 @@ def read_camchain(path: str | PathLike[str]) -> CamChain:
             offsets.append(number("timeshift_cam_imu", section.get("timeshift_cam_imu", 0.0)))
         except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{path}: {short(name, 40)}: {short(error, 500)}") from None
-    return CamChain(tuple(cameras), torch.stack(poses), torch.tensor(offsets, dtype=torch.float64))
+    try:
+        return CamChain(tuple(cameras), torch.stack(poses), torch.tensor(offsets, dtype=torch.float64))
+    except ValueError as error:
+        raise ValueError(f"{path}: {short(error, 500)}") from None
 
 
 def write_camchain(path: str | PathLike[str], chain: CamChain) -> None:
