@@ -13,6 +13,7 @@ from torchspline.calibrate.start import Start
 from torchspline.fit import Huber
 from torchspline.imu import ImuNoise, measure
 from torchspline.io import ImuRecord
+from torchspline.kernels.mode import use_kernels
 
 F64 = torch.float64
 SHORT = {"seconds": 6.0, "images": 60, "samples": 1200, "spacing": 0.05}
@@ -217,9 +218,8 @@ def test_biases_that_change(simulated, start):
     assert found.result.cost[-1] < constant.result.cost[-1]
 
 
-def test_a_second_imu(simulated):
-    """Somewhere else, turned, with biases and a clock of its own."""
-    made, ahead = simulated, 0.003
+def with_second_imu(made: Simulation, ahead: float) -> tuple[Recording, torch.Tensor, tuple[torch.Tensor, ...]]:
+    """Somewhere else, turned, with biases and a clock of its own: its pose in the first IMU and those biases."""
     T = SE3.exp(torch.tensor([0.05, -0.08, 0.03, 0.4, -0.9, 2.0], dtype=F64))
     stamps = made.recording.imus[0].time_ns[10:-10]
     biases = torch.tensor([0.01, -0.02, 0.005], dtype=F64), torch.tensor([0.1, 0.05, -0.2], dtype=F64)
@@ -231,7 +231,12 @@ def test_a_second_imu(simulated):
     ]
     second = ImuRecord(stamps + round(ahead * 1e9), *noisy)
     first = made.recording
-    recording = replace(first, imus=(*first.imus, second), noise=first.noise * 2)
+    return replace(first, imus=(*first.imus, second), noise=first.noise * 2), T, biases
+
+
+def test_a_second_imu(simulated):
+    made, ahead = simulated, 0.003
+    recording, T, biases = with_second_imu(made, ahead)
     found = calibrate(recording, spacing=0.05, stretch=None)
     assert_true(found, made)
     imu = found.imus[1]
@@ -244,6 +249,24 @@ def test_a_second_imu(simulated):
     assert abs(imu.time_offset - ahead) < 4.5 * imu.time_offset_sigma < 1e-4
     assert bool(((imu.gyro_bias - biases[0]).abs() < 4.5 * imu.gyro_bias_sigma).all())
     assert bool(((imu.accel_bias - biases[1]).abs() < 4.5 * imu.accel_bias_sigma).all())
+
+
+def test_scalings_of_a_second_imu_do_not_turn_its_frame(simulated):
+    recording, _, _ = with_second_imu(simulated, 0.0)
+    recording = replace(recording.only(0).between(0.0, 3.0), gravity=9.80665)
+    with use_kernels("reference"):  # loops for these residuals take longer to compile
+        found = calibrate(
+            recording, spacing=0.05, estimate=("imu_scaling",), stretch=None, reweigh=False, max_iterations=4
+        )
+    assert not found.observability
+    for imu in found.imus:
+        for S, sigma in (
+            (imu.gyro_scaling, imu.gyro_scaling_sigma),
+            (imu.accel_scaling, imu.accel_scaling_sigma),
+        ):
+            assert S is not None
+            assert bool(((S - torch.eye(3)).abs() < 4.5 * sigma).all())
+        assert float(imu.accel_scaling.triu(1).abs().max()) < 1e-8
 
 
 def test_outliers_are_not_believed(simulated, start):

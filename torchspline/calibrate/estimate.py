@@ -105,7 +105,8 @@ class CalibratedImu:
         T_imu0_imu: (7,) SE3, maps its points into the frame of the first IMU. Its deviations (6,) are of the position
             in the first IMU, m, and of a body tangent of the rotation, rad.
         time_offset: s, `t_imu_i = t_imu0 + time_offset`.
-        gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of the first accelerometer is lower triangular.
+        gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of an accelerometer is lower triangular,
+            which says how the frame of its IMU lies.
     """
 
     name: str

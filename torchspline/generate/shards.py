@@ -4,6 +4,7 @@ import glob
 import hashlib
 import importlib.metadata
 import json
+import operator
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -118,11 +119,7 @@ class ShardedDataset(Dataset):
         folder = _path(folder)
         if not (folder / MANIFEST).is_file():
             raise FileNotFoundError(f"folder: expected {MANIFEST} in it, found none in {folder}")
-        self.manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        if self.manifest.get("format") != FORMAT:
-            raise ValueError(
-                f"folder: expected a data set of format {FORMAT!r} in {folder}, got {self.manifest.get('format')!r}"
-            )
+        self.manifest = _read_manifest(folder)
         numbers = range(self.manifest["shards"])
         self.files = [folder / shard_name(shard) for shard in numbers]
         missing = [path.name for path in self.files if not path.is_file()]
@@ -140,6 +137,10 @@ class ShardedDataset(Dataset):
         return self.manifest["items"]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        try:
+            index = operator.index(index)
+        except TypeError:
+            raise TypeError(f"index: expected a whole number, got {type(index).__name__}") from None
         if not -len(self) <= index < len(self):
             raise IndexError(f"index: expected one below {len(self)}, got {index}")
         index %= len(self)
@@ -213,10 +214,27 @@ def _text(manifest: dict[str, Any]) -> str:
     return json.dumps(manifest, indent=2) + "\n"
 
 
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # neither JSON nor text
+        raise ValueError(f"folder: {path} is damaged: {error}; choose another folder") from None
+    name = found.get("format") if isinstance(found, dict) else found
+    if name != FORMAT:
+        raise ValueError(f"folder: expected a data set of format {FORMAT!r} in {folder}, got {name!r}")
+    for name in ("items", "items_per_shard", "shards"):
+        if not isinstance(found.get(name), int) or found[name] < 1:
+            raise ValueError(
+                f"folder: {path} is damaged: {name}: expected a whole number of at least 1, got {found.get(name)!r}"
+            )
+    return found
+
+
 def _agree(folder: Path, manifest: dict[str, Any]) -> None:
     if not (folder / MANIFEST).exists():
         return
-    there = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    there = _read_manifest(folder)
     different = [name for name in manifest | there if manifest.get(name) != there.get(name)]
     if different:
         name = different[0]
@@ -233,6 +251,8 @@ def _count(manifest: dict[str, Any], shard: int) -> int:
 
 def _is_complete(path: Path, manifest: dict[str, Any], shard: int) -> bool:
     """Whether the shard is there and readable; an error if it belongs to another data set."""
+    if path.exists() and not path.is_file():
+        raise ValueError(f"folder: expected {path} to be a file, got a folder; remove it")
     if not path.is_file():
         return False
     library = pyarrow()
