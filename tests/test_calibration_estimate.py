@@ -218,7 +218,9 @@ def test_biases_that_change(simulated, start):
     assert found.result.cost[-1] < constant.result.cost[-1]
 
 
-def with_second_imu(made: Simulation, ahead: float) -> tuple[Recording, torch.Tensor, tuple[torch.Tensor, ...]]:
+def with_second_imu(
+    made: Simulation, ahead: float
+) -> tuple[Recording, torch.Tensor, tuple[torch.Tensor, ...]]:
     """Somewhere else, turned, with biases and a clock of its own: its pose in the first IMU and those biases."""
     T = SE3.exp(torch.tensor([0.05, -0.08, 0.03, 0.4, -0.9, 2.0], dtype=F64))
     stamps = made.recording.imus[0].time_ns[10:-10]

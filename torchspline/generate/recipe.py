@@ -51,7 +51,10 @@ class Recipe:
             object.__setattr__(self, name, checks.positive(name, number_at(name, getattr(self, name))))
         checks.choice("mounting", self.mounting, MOUNTINGS)
         checks.choice("dtype", self.dtype, ("float32", "float64"))
-        for name, count in (("rate", self.duration * self.rate), ("knot_spacing", self.duration / self.knot_spacing)):
+        for name, count in (
+            ("rate", self.duration * self.rate),
+            ("knot_spacing", self.duration / self.knot_spacing),
+        ):
             if count > MOST:
                 raise ValueError(
                     f"{name}: expected at most {MOST} readings and as many control points in an item, got {count:.3g} "
