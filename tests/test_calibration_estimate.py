@@ -271,6 +271,51 @@ def test_scalings_of_a_second_imu_do_not_turn_its_frame(simulated):
         assert float(imu.accel_scaling.triu(1).abs().max()) < 1e-8
 
 
+def with_noise(recording: Recording, factor: float) -> Recording:
+    """Stated so many times as large."""
+    stated = recording.noise[0]
+    densities = stated.gyroscope_noise_density * factor, stated.accelerometer_noise_density * factor
+    return replace(recording, noise=(replace(stated, gyroscope_noise_density=densities[0],
+                                             accelerometer_noise_density=densities[1]),))  # fmt: skip
+
+
+def test_noise_stated_a_thousand_times_too_large(calibration, simulated, start):
+    """Images lead the first solution then, and residuals of the IMU are those of their noise."""
+    found = calibrate(with_noise(simulated.recording, 1e3), start, spacing=0.05, stretch=None)
+    assert_true(found, simulated)
+    for x, expected in zip(
+        (found.imus[0].gyroscope, found.imus[0].accelerometer),
+        (calibration.imus[0].gyroscope, calibration.imus[0].accelerometer),
+        strict=True,
+    ):
+        assert x.sigma == pytest.approx(expected.sigma, rel=0.1)
+    ratio = found.cameras[0].T_imu_cam_sigma / calibration.cameras[0].T_imu_cam_sigma
+    assert float(ratio.log().abs().max()) < 0.1
+
+
+def test_noise_stated_far_too_small_is_named(simulated, start):
+    with pytest.raises(
+        ValueError, match=r"not determine all .* noise densities and pixel_sigma = 0.5 .* right size"
+    ):
+        calibrate(with_noise(simulated.recording, 1e-3), start, spacing=0.05, stretch=None)
+
+
+def test_a_recording_without_noise():
+    made = simulate(
+        **{**SHORT, "seconds": 3.0},
+        cameras=1,
+        pixel_sigma=0.0,
+        noise=ImuNoise(1e-12, 1e-12, 0.0, 0.0),
+        seed=1,
+    )
+    recording = with_noise(made.recording, 1e9)
+    found = calibrate(recording, spacing=0.05, stretch=None)
+    assert all(float(error.abs().max()) < 4.5 for error in misses(found, made).values())
+    camera = found.cameras[0]
+    assert float(SE3.log(SE3.compose(SE3.inverse(made.T_imu_cam[0]), camera.T_imu_cam)).abs().max()) < 1e-9
+    assert camera.residuals.sigma == pytest.approx(1e-4 * camera.residuals.stated)
+
+
 def test_outliers_are_not_believed(simulated, start):
     """Two in a hundred corners are wrong by up to 30 px."""
     g = torch.Generator().manual_seed(3)
