@@ -386,6 +386,19 @@ def test_recordings_that_cannot_be_calibrated(simulated, start):
     gap = ImuRecord(*(x[keep] for x in (imu.time_ns, imu.gyroscope, imu.accelerometer)))
     with pytest.raises(ValueError, match=r"readings at most 0.2 s apart .* got a gap of 1.0\d* s"):
         calibrate(replace(recording, imus=(gap,)), start, spacing=0.05)
+    for name, x, said in (
+        (
+            "time_offset",
+            start.time_offset * torch.nan,
+            "start: time_offset: expected finite numbers, got nan",
+        ),
+        ("time_offset", start.time_offset[:1], "start: expected 2 rows of time_offset, .* got 1"),
+        ("gyro_bias", start.gyro_bias[:0], "start: expected 1 rows of gyro_bias, .* got 0"),
+        ("T_imu_cam", start.T_imu_cam * torch.nan, "start: T_imu_cam: expected finite numbers"),
+        ("gravity", start.gravity * 0, "start: gravity: expected a direction"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            calibrate(recording, replace(start, **{name: x}), spacing=0.05)
     with pytest.raises(ValueError, match=r"start: expected 1 rows of T_imu_cam, .* got 2"):
         calibrate(recording.only(0), start, spacing=0.05)
 

@@ -318,12 +318,21 @@ def _check_start(start: Start, recording: Recording) -> None:
     checks.instance("start", start, Start, "a torchspline.calibrate.Start")
     for name, x, count in (
         ("T_imu_cam", start.T_imu_cam, len(recording.cameras)),
+        ("time_offset", start.time_offset, len(recording.cameras)),
+        ("boards", start.boards, len(recording.cameras)),
         ("T_imu0_imu", start.T_imu0_imu, len(recording.imus)),
+        ("imu_time_offset", start.imu_time_offset, len(recording.imus)),
+        ("gyro_bias", start.gyro_bias, len(recording.imus)),
+        ("accel_bias", start.accel_bias, len(recording.imus)),
     ):
         if len(x) != count:
             raise ValueError(
                 f"start: expected {count} rows of {name}, one a sensor of the recording, got {len(x)}"
             )
+        if isinstance(x, Tensor):
+            checks.finite(f"start: {name}", x)
+    if not float(start.gravity.norm()) > 0:
+        raise ValueError(f"start: gravity: expected a direction, got {start.gravity.tolist()}")
 
 
 # ---------------------------------------------------------------------- what was found
