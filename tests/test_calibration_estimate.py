@@ -271,6 +271,14 @@ def test_scalings_of_a_second_imu_do_not_turn_its_frame(simulated):
         assert float(imu.accel_scaling.triu(1).abs().max()) < 1e-8
 
 
+@pytest.mark.parametrize("stretch", [1e-9, 1e-300])
+def test_stretches_shorter_than_knots_are_apart(calibration, stretch):
+    """As many stretches as there are segments, not a row for each nanosecond."""
+    (variable,) = (x for x in calibration.result._linearizer.model.variables if x.name == "cam0 extrinsics")
+    found = calibration.result.standard_deviation(variable, stretch)
+    assert torch.equal(found, calibration.result.standard_deviation(variable, 0.05))
+
+
 def with_noise(recording: Recording, factor: float) -> Recording:
     """Stated so many times as large."""
     stated = recording.noise[0]
