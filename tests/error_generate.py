@@ -101,6 +101,11 @@ def recipes() -> Iterator[Case]:
     function = "Recipe"
     for name in ("duration", "rate", "knot_spacing"):
         yield from positive(function, name)
+    for name, bad in (("rate", 1e300), ("knot_spacing", 1e-12)):
+        yield refused(function, name, "option", bad, "in 0.1 s", "expected at most 10000000 readings")
+    yield refused(
+        function, "duration", "option", 1e12, "in 1e+12 s", "expected at most 10000000 readings", "rate"
+    )
     for name in ("motions", "sensor"):
         for bad in (None, 5, ["smooth"]):
             yield refused(function, name, "type", bad, f"got {bad!r}", "expected a mapping")

@@ -13,6 +13,7 @@ from torchspline.calibrate.start import Start
 from torchspline.fit import Huber
 from torchspline.imu import ImuNoise, measure
 from torchspline.io import ImuRecord
+from torchspline.kernels.mode import use_kernels
 
 F64 = torch.float64
 SHORT = {"seconds": 6.0, "images": 60, "samples": 1200, "spacing": 0.05}
@@ -217,9 +218,10 @@ def test_biases_that_change(simulated, start):
     assert found.result.cost[-1] < constant.result.cost[-1]
 
 
-def test_a_second_imu(simulated):
-    """Somewhere else, turned, with biases and a clock of its own."""
-    made, ahead = simulated, 0.003
+def with_second_imu(
+    made: Simulation, ahead: float
+) -> tuple[Recording, torch.Tensor, tuple[torch.Tensor, ...]]:
+    """Somewhere else, turned, with biases and a clock of its own: its pose in the first IMU and those biases."""
     T = SE3.exp(torch.tensor([0.05, -0.08, 0.03, 0.4, -0.9, 2.0], dtype=F64))
     stamps = made.recording.imus[0].time_ns[10:-10]
     biases = torch.tensor([0.01, -0.02, 0.005], dtype=F64), torch.tensor([0.1, 0.05, -0.2], dtype=F64)
@@ -231,7 +233,12 @@ def test_a_second_imu(simulated):
     ]
     second = ImuRecord(stamps + round(ahead * 1e9), *noisy)
     first = made.recording
-    recording = replace(first, imus=(*first.imus, second), noise=first.noise * 2)
+    return replace(first, imus=(*first.imus, second), noise=first.noise * 2), T, biases
+
+
+def test_a_second_imu(simulated):
+    made, ahead = simulated, 0.003
+    recording, T, biases = with_second_imu(made, ahead)
     found = calibrate(recording, spacing=0.05, stretch=None)
     assert_true(found, made)
     imu = found.imus[1]
@@ -244,6 +251,77 @@ def test_a_second_imu(simulated):
     assert abs(imu.time_offset - ahead) < 4.5 * imu.time_offset_sigma < 1e-4
     assert bool(((imu.gyro_bias - biases[0]).abs() < 4.5 * imu.gyro_bias_sigma).all())
     assert bool(((imu.accel_bias - biases[1]).abs() < 4.5 * imu.accel_bias_sigma).all())
+
+
+def test_scalings_of_a_second_imu_do_not_turn_its_frame(simulated):
+    recording, _, _ = with_second_imu(simulated, 0.0)
+    recording = replace(recording.only(0).between(0.0, 3.0), gravity=9.80665)
+    with use_kernels("reference"):  # loops for these residuals take longer to compile
+        found = calibrate(
+            recording, spacing=0.05, estimate=("imu_scaling",), stretch=None, reweigh=False, max_iterations=4
+        )
+    assert not found.observability
+    for imu in found.imus:
+        for S, sigma in (
+            (imu.gyro_scaling, imu.gyro_scaling_sigma),
+            (imu.accel_scaling, imu.accel_scaling_sigma),
+        ):
+            assert S is not None
+            assert bool(((S - torch.eye(3)).abs() < 4.5 * sigma).all())
+        assert float(imu.accel_scaling.triu(1).abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize("stretch", [1e-9, 1e-300])
+def test_stretches_shorter_than_knots_are_apart(calibration, stretch):
+    """As many stretches as there are segments, not a row for each nanosecond."""
+    (variable,) = (x for x in calibration.result._linearizer.model.variables if x.name == "cam0 extrinsics")
+    found = calibration.result.standard_deviation(variable, stretch)
+    assert torch.equal(found, calibration.result.standard_deviation(variable, 0.05))
+
+
+def with_noise(recording: Recording, factor: float) -> Recording:
+    """Stated so many times as large."""
+    stated = recording.noise[0]
+    densities = stated.gyroscope_noise_density * factor, stated.accelerometer_noise_density * factor
+    return replace(recording, noise=(replace(stated, gyroscope_noise_density=densities[0],
+                                             accelerometer_noise_density=densities[1]),))  # fmt: skip
+
+
+def test_noise_stated_a_thousand_times_too_large(calibration, simulated, start):
+    """Images lead the first solution then, and residuals of the IMU are those of their noise."""
+    found = calibrate(with_noise(simulated.recording, 1e3), start, spacing=0.05, stretch=None)
+    assert_true(found, simulated)
+    for x, expected in zip(
+        (found.imus[0].gyroscope, found.imus[0].accelerometer),
+        (calibration.imus[0].gyroscope, calibration.imus[0].accelerometer),
+        strict=True,
+    ):
+        assert x.sigma == pytest.approx(expected.sigma, rel=0.1)
+    ratio = found.cameras[0].T_imu_cam_sigma / calibration.cameras[0].T_imu_cam_sigma
+    assert float(ratio.log().abs().max()) < 0.1
+
+
+def test_noise_stated_far_too_small_is_named(simulated, start):
+    with pytest.raises(
+        ValueError, match=r"not determine all .* noise densities and pixel_sigma = 0.5 .* right size"
+    ):
+        calibrate(with_noise(simulated.recording, 1e-3), start, spacing=0.05, stretch=None)
+
+
+def test_a_recording_without_noise():
+    made = simulate(
+        **{**SHORT, "seconds": 3.0},
+        cameras=1,
+        pixel_sigma=0.0,
+        noise=ImuNoise(1e-12, 1e-12, 0.0, 0.0),
+        seed=1,
+    )
+    recording = with_noise(made.recording, 1e9)
+    found = calibrate(recording, spacing=0.05, stretch=None)
+    assert all(float(error.abs().max()) < 4.5 for error in misses(found, made).values())
+    camera = found.cameras[0]
+    assert float(SE3.log(SE3.compose(SE3.inverse(made.T_imu_cam[0]), camera.T_imu_cam)).abs().max()) < 1e-9
+    assert camera.residuals.sigma == pytest.approx(1e-4 * camera.residuals.stated)
 
 
 def test_outliers_are_not_believed(simulated, start):
@@ -316,6 +394,19 @@ def test_recordings_that_cannot_be_calibrated(simulated, start):
     gap = ImuRecord(*(x[keep] for x in (imu.time_ns, imu.gyroscope, imu.accelerometer)))
     with pytest.raises(ValueError, match=r"readings at most 0.2 s apart .* got a gap of 1.0\d* s"):
         calibrate(replace(recording, imus=(gap,)), start, spacing=0.05)
+    for name, x, said in (
+        (
+            "time_offset",
+            start.time_offset * torch.nan,
+            "start: time_offset: expected finite numbers, got nan",
+        ),
+        ("time_offset", start.time_offset[:1], "start: expected 2 rows of time_offset, .* got 1"),
+        ("gyro_bias", start.gyro_bias[:0], "start: expected 1 rows of gyro_bias, .* got 0"),
+        ("T_imu_cam", start.T_imu_cam * torch.nan, "start: T_imu_cam: expected finite numbers"),
+        ("gravity", start.gravity * 0, "start: gravity: expected a direction"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            calibrate(recording, replace(start, **{name: x}), spacing=0.05)
     with pytest.raises(ValueError, match=r"start: expected 1 rows of T_imu_cam, .* got 2"):
         calibrate(recording.only(0), start, spacing=0.05)
 

@@ -243,6 +243,31 @@ def test_large_residuals_and_deviations_are_noticed(calibration):
     assert len(warnings) == 3
 
 
+@pytest.mark.parametrize(
+    ("board", "gravity", "scale", "said"),
+    [
+        (
+            1.1,
+            9.80665,
+            1.0,
+            r"the motion in the images is at least [45]\.\d% too large for it: .* size of the board",
+        ),
+        (0.9, 9.80665, 1.0, r"the motion in the images is at least [56]\.\d% too small for it"),
+        (1.0, 9.6, 1.0, r"gravity is at least [01]\.\d% too small for it: is its magnitude right"),
+        (1.0, 9.80665, 1.05, r"reads motion and gravity at least [23]\.\d% too large: is its scale right"),
+    ],
+)
+def test_wrong_sizes_are_noticed(simulated, board, gravity, scale, said):
+    """Of the board, of gravity and of what the accelerometer reads: solutions converge to something else."""
+    recording = simulated.recording
+    corners = tuple(replace(x, xyz=board * x.xyz) for x in recording.corners)
+    imu = recording.imus[0]
+    imus = (ImuRecord(imu.time_ns, imu.gyroscope, scale * imu.accelerometer),)
+    found = calibrate(replace(recording, corners=corners, imus=imus, gravity=gravity), spacing=SPACING)
+    (warning,) = (x for x in coverage(found).warnings if x.startswith("imu0 accelerometer: "))
+    assert re.search(said, warning), warning
+
+
 # ---------------------------------------------------------------------- the command
 
 

@@ -300,3 +300,11 @@ def test_items_differ_between_seeds_blocks_and_rows():
         first.roll(1, 0),
     ):
         assert (first - other).abs().amax((1, 2)).min() > 1e-3
+
+
+def test_numbers_that_yaml_takes_for_text():
+    """YAML 1.1 reads `1e2`, without a point, as text."""
+    found = Recipe(motions={"smooth": {"bandwidth": "1e0"}}, duration="1e0", rate="5e1", knot_spacing="2e-2")
+    assert (found.samples, found.duration, found.knot_spacing) == (50, 1.0, 0.02)
+    plain = Recipe(motions={"smooth": {"bandwidth": 1.0}}, duration=1.0, rate=50.0)
+    assert torch.equal(compute_block(found, 0, 0)["gyroscope"], compute_block(plain, 0, 0)["gyroscope"])

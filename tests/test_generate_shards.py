@@ -165,6 +165,42 @@ def test_incomplete_and_damaged_data_sets_are_not_read(tmp_path):
         read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda x: x[: len(x) // 2], "dataset.json is damaged: .*choose another folder"),
+        (lambda x: "", "dataset.json is damaged"),
+        (lambda x: "[]", r"expected a data set of format .*, got \[\]"),
+        (lambda x: x.replace('"shards": 1', '"shards": "x"'), "shards: expected a whole number.* got 'x'"),
+        (lambda x: '{"format": "torchspline items 1"}', "items: expected a whole number.* got None"),
+    ],
+)
+def test_a_damaged_manifest_is_named(tmp_path, change, said):
+    arguments = {"seed": 7, "items": 3, "items_per_shard": 3}
+    write(RECIPE, tmp_path, **arguments)
+    path = tmp_path / "dataset.json"
+    path.write_text(change(path.read_text()))
+    for call in (lambda: read(tmp_path), lambda: write(RECIPE, tmp_path, **arguments)):
+        with pytest.raises(ValueError, match=f"folder: .*{said}"):
+            call()
+
+
+def test_a_folder_in_place_of_a_shard_is_named(tmp_path):
+    write(RECIPE, tmp_path, seed=7, items=3)
+    path = tmp_path / "shard-000000.parquet"
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(ValueError, match=r"shard-000000.parquet to be a file, got a folder; remove it"):
+        write(RECIPE, tmp_path, seed=7, items=3)
+
+
+def test_items_are_asked_for_by_whole_numbers(folder):
+    data = read(folder)
+    for bad in (slice(1, 3), 1.5, "1"):
+        with pytest.raises(TypeError, match=f"index: expected a whole number, got {type(bad).__name__}"):
+            data[bad]
+
+
 def test_without_pyarrow_the_message_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for function in (lambda: read(tmp_path), lambda: write(RECIPE, tmp_path, seed=0, items=1)):

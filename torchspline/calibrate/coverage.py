@@ -25,6 +25,8 @@ _UNSURE = (0.01, math.radians(0.5))
 #: Residuals may differ from what was stated by this factor.
 _FACTOR = 3.0
 _MOST_TIMES = 10_000
+#: By how much motion and gravity may miss what the accelerometer says of their size, as shares, and in deviations.
+_MOTION_OFF, _GRAVITY_OFF, _SIGNIFICANT = 0.01, 0.003, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +76,9 @@ def coverage(calibration: Calibration) -> Coverage:
     used = calibration.imus[0].gyroscope.used
     t = calibration.recording.imus[0].time_ns[used]
     duration = float(t[-1] - t[0]) * 1e-9
+    step = max(1, len(t) // _MOST_TIMES)
     with torch.no_grad():
-        motion = calibration.trajectory.kinematics(t[:: max(1, len(t) // _MOST_TIMES)])
+        motion = calibration.trajectory.kinematics(t[::step])
     assert motion.acceleration is not None
     assert motion.angular_velocity is not None
     assert motion.rotation is not None
@@ -98,8 +101,48 @@ def coverage(calibration: Calibration) -> Coverage:
         warnings += _of_camera(found, image)
     for imu in calibration.imus:
         warnings += _of_imu(imu)
+    if calibration.imus[0].accel_scaling is None:
+        warnings += _of_sizes(calibration.imus[0].accelerometer, step, a, -down)
     warnings += [f"unknowns are left open: {direction}" for direction in calibration.observability]
     return Coverage(duration, _rms(w), _rms(a), tilt, cameras, warnings)
+
+
+def _of_sizes(residuals: SensorResiduals, step: int, motion: Tensor, weight: Tensor) -> list[str]:
+    """Whether residuals of the accelerometer go along with the motion, with gravity, or with both.
+
+    A wrong size of the board scales the motion, and biases take up a part of a wrong gravity: nothing else shows them.
+    A regression on both tells less than is wrong, as the trajectory gives way.
+
+    Args:
+        residuals: of which every `step`-th is looked at. motion, weight: (N, 3) what it should have read of each.
+    """
+    x = torch.stack([(y - y.mean(0)).reshape(-1) for y in (motion, weight)], dim=1)
+    y = residuals.values[::step]
+    matrix = x.mT @ x
+    if not float(torch.linalg.cond(matrix)) < 1e8:
+        return []
+    inverse = torch.linalg.inv(matrix)
+    off = inverse @ (x.mT @ (y - y.mean(0)).reshape(-1))
+    sure = off.abs() > _SIGNIFICANT * residuals.sigma * inverse.diagonal().sqrt()
+    moved, weighed = (sure & (off.abs() > torch.tensor([_MOTION_OFF, _GRAVITY_OFF]))).tolist()
+    size, gravity = off.tolist()
+    if moved and weighed and 0.5 < size / gravity < 2.0:
+        return [
+            f"{residuals.name}: it reads motion and gravity at least {abs(size):.1%} too "
+            f"{'small' if size > 0 else 'large'}: is its scale right?"
+        ]
+    found = []
+    if moved:
+        found.append(
+            f"{residuals.name}: the motion in the images is at least {abs(size):.1%} too "
+            f"{'large' if size > 0 else 'small'} for it: are the size of the board and the focal lengths right?"
+        )
+    if weighed:
+        found.append(
+            f"{residuals.name}: gravity is at least {abs(gravity):.1%} too {'large' if gravity > 0 else 'small'} for "
+            "it: is its magnitude right?"
+        )
+    return found
 
 
 def cells(camera: Camera, uv: Tensor) -> Tensor:

@@ -32,6 +32,11 @@ from torchspline.splines.bspline import BSpline
 _ROUGH = 1e-2
 #: Accelerometers hold fast motion so much tighter than slow that more damping, a share of the diagonal, slows down.
 _FIRST_DAMPING, _DAMPING = 1e-8, 1e-12
+#: A sensor that is so much quieter than stated had too little weight for its own residuals to tell how quiet it is:
+#: they are looked at again with the new weights, at most so often.
+_QUIETER, _ROUNDS = 0.2, 6
+#: What is quieter than this share of what was stated has no noise at all, and rounding is no measure of weights.
+_LEAST = 1e-4
 _LOSS = Huber(3.0)
 
 
@@ -105,7 +110,8 @@ class CalibratedImu:
         T_imu0_imu: (7,) SE3, maps its points into the frame of the first IMU. Its deviations (6,) are of the position
             in the first IMU, m, and of a body tangent of the rotation, rad.
         time_offset: s, `t_imu_i = t_imu0 + time_offset`.
-        gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of the first accelerometer is lower triangular.
+        gyro_scaling, accel_scaling: (3, 3) scale and misalignment; that of an accelerometer is lower triangular,
+            which says how the frame of its IMU lies.
     """
 
     name: str
@@ -201,7 +207,7 @@ def calibrate(
         reweigh: replace the standard deviations of corners, gyroscopes and accelerometers by what their residuals say
             after a first solution, one factor a sensor, so that those of the results are realistic: densities of data
             sheets know nothing of vibration, splines that are too smooth, or boards that are not flat. With False,
-            what was stated.
+            what was stated. A sensor much quieter than stated is looked at again.
         stretch: s. Standard deviations hold when errors are alike over stretches of this length, see
             `Result.standard_deviation`: biases that wander, a distortion that is not quite the lens's, corners that are
             all seen too far inside. On real recordings those are ten times what independent errors (None) would give.
@@ -235,12 +241,17 @@ def calibrate(
     stated = {residual.name: sigma_of(residual) for residual in layout.residuals}
     now, seconds["weights"] = perf_counter(), 0.0
     solve = partial(layout.problem.solve, max_iterations=max_iterations, progress=progress)
-    if reweigh:
+    for _ in range(_ROUNDS if reweigh else 0):
         first = solve(cost_tolerance=max(_ROUGH, cost_tolerance), damping=_FIRST_DAMPING)
         before = perf_counter()
-        for name, factor in noise_factors(first, layout.residuals).items():
-            rescale(next(x for x in layout.residuals if x.name == name), factor)
-        seconds["weights"] = perf_counter() - before
+        factors = _factors(first, layout, start, options)
+        for residual in layout.residuals:
+            least = _LEAST * stated[residual.name] / sigma_of(residual)
+            factors[residual.name] = max(factors.get(residual.name, 1.0), least)
+            rescale(residual, factors[residual.name])
+        seconds["weights"] += perf_counter() - before
+        if min(factors.values()) > _QUIETER:
+            break
     result = solve(cost_tolerance=cost_tolerance, damping=_DAMPING if reweigh else _FIRST_DAMPING)
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
@@ -261,6 +272,18 @@ def calibrate(
         cameras, imus, layout.gravity.value, gravity_sigma, layout.trajectory, result, recording, start,
         seconds, notes,
     )  # fmt: skip
+
+
+def _factors(first: Result, layout: Layout, start: Start, options: Options) -> dict[str, float]:
+    """What to multiply standard deviations by; where that fails, what may be wrong."""
+    try:
+        return noise_factors(first, layout.residuals)
+    except ValueError as error:
+        noted = f"; noted before: {'; '.join(start.notes)}" if start.notes else ""
+        raise ValueError(
+            f"{error}. Have knots {options.spacing:g} s apart enough readings, are the noise densities and "
+            f"pixel_sigma = {options.pixel_sigma:g} of the right size to each other, is the board in m?{noted}"
+        ) from None
 
 
 def _checked(
@@ -295,12 +318,21 @@ def _check_start(start: Start, recording: Recording) -> None:
     checks.instance("start", start, Start, "a torchspline.calibrate.Start")
     for name, x, count in (
         ("T_imu_cam", start.T_imu_cam, len(recording.cameras)),
+        ("time_offset", start.time_offset, len(recording.cameras)),
+        ("boards", start.boards, len(recording.cameras)),
         ("T_imu0_imu", start.T_imu0_imu, len(recording.imus)),
+        ("imu_time_offset", start.imu_time_offset, len(recording.imus)),
+        ("gyro_bias", start.gyro_bias, len(recording.imus)),
+        ("accel_bias", start.accel_bias, len(recording.imus)),
     ):
         if len(x) != count:
             raise ValueError(
                 f"start: expected {count} rows of {name}, one a sensor of the recording, got {len(x)}"
             )
+        if isinstance(x, Tensor):
+            checks.finite(f"start: {name}", x)
+    if not float(start.gravity.norm()) > 0:
+        raise ValueError(f"start: gravity: expected a direction, got {start.gravity.tolist()}")
 
 
 # ---------------------------------------------------------------------- what was found

@@ -29,7 +29,7 @@ GROUPS = {"split": "R3xSO3", "joint": "SE3"}
 CHOICES = ("time_offset", "intrinsics", "line_delay", "imu_scaling")
 #: How long before the first and after the last image the trajectory goes on, where the IMU does, s.
 _PAD = 0.1
-#: Off-diagonal numbers of an accelerometer's scaling that would turn the frame of the IMU, and what they may be.
+#: Off-diagonal numbers of an accelerometer's scaling that would turn the frame of its IMU, and what they may be.
 _ABOVE_DIAGONAL, _FIXED, _FREE = (1, 2, 5), 1e-9, 1.0
 _UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -237,8 +237,9 @@ def _add_imu(layout: Layout, recording: Recording, i: int, start: Start, options
     )
     layout.problem.add(gyroscope)
     layout.problem.add(accelerometer)
-    if scaling and i == 0:
-        # The frame of the IMU is that of its accelerometer: x along its first axis, y in the plane of the first two.
+    if scaling:
+        # The frame of an IMU is that of its accelerometer, x along its first axis, y in the plane of the first two: a
+        # rotation of the sensor and two full matrices would say the same thing twice.
         sigma = torch.full((9,), _FREE, dtype=torch.float64)
         sigma[list(_ABOVE_DIAGONAL)] = _FIXED
         layout.problem.add_prior(scaling["accel"], sigma=sigma)

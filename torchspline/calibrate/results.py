@@ -31,7 +31,8 @@ def write_calibration(folder: str | PathLike[str], calibration: Calibration) -> 
         folder: made if it is not there.
     Returns:
         What to be wary of, in words, as the report has it: directions in which there was little motion, parts of the
-        images without corners, residuals larger than the noise that was stated. None is good.
+        images without corners, residuals larger than the noise that was stated, a board, gravity or accelerometer whose
+        size does not fit the rest. None is good.
     Raises:
         TypeError: no path, or no Calibration.
         ValueError: the folder is a file.

@@ -111,8 +111,11 @@ def rows(found: Calibration) -> list[tuple[str, ...]]:
 
     for i, camera in enumerate(found.cameras):
         pose, sigma = camera.T_imu_cam.tolist(), camera.T_imu_cam_sigma.tolist()
-        add(f"T_imu_cam{i} position", pose[:3], sigma[:3], "m", 5)
-        add(f"T_imu_cam{i} quaternion w x y z", pose[3:], sigma[3:], "rad", 6)
+        # Values are in the frame of the IMU, deviations in that of the camera: not in one row.
+        add(f"T_imu_cam{i} position x y z", pose[:3], None, "m", 5)
+        add(f"T_imu_cam{i} quaternion w x y z", pose[3:], None, "", 6)
+        add(f"position of {camera.name}, error along its x y z", [], sigma[:3], "m", 5)
+        add(f"rotation of {camera.name}, error about its x y z", [], sigma[3:], "rad", 6)
         deviation = None if camera.time_offset_sigma is None else [1e3 * camera.time_offset_sigma]
         add(f"time offset of {camera.name}", [1e3 * camera.time_offset], deviation, "ms", 4)
         if camera.intrinsics_sigma is not None:

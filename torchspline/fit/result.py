@@ -187,7 +187,8 @@ class Result:
         Args:
             stretch: s. Residuals may be correlated within stretches of the trajectory of this length, as they are where
                 a model is not exact or a bias wanders: the scatter of what stretches pull at counts then
-                (the cluster-robust covariance [Liang and Zeger 1986]), where it is larger. There are six at least.
+                (the cluster-robust covariance [Liang and Zeger 1986]), where it is larger. There are six
+                at least, and no more than the trajectory has stretches between knots.
         Raises:
             ValueError: as `covariance`; a stretch that is not above zero; too many variables for a band with a border.
         """

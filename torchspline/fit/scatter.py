@@ -33,7 +33,8 @@ def scatter(linearizer: "Linearizer", state: State, factor: Factor, seconds: flo
         )
     model = linearizer.model
     length = model.trajectory.segments * model.trajectory.spacing
-    count = max(round(length / seconds), _FEWEST)
+    # Stretches much shorter than measurements are apart would say no more, and be too many to hold.
+    count = max(round(min(length / seconds, model.trajectory.segments)), _FEWEST)
     pulls = np.zeros((count, model.total - model.band))
     for term in linearizer.terms:
         if isinstance(term, Term):

@@ -17,8 +17,8 @@ from torchspline.kernels.band import inverse_band
 Array = NDArray[Any]
 
 
-#: Rows of a piece in `_inner`.
-_PIECE = 256
+#: Rows of a piece in `_inner`; columns of a sparse system's inverse at a time.
+_PIECE, _COLUMNS = 256, 256
 
 
 class Rows(NamedTuple):
@@ -329,9 +329,18 @@ class SparseFactor(Factor):
 
     def inverse(self, i: Array, j: Array) -> Array:
         needed, which = np.unique(j, return_inverse=True)
-        unit = np.zeros((self._lu.shape[0], len(needed)))
-        unit[needed, np.arange(len(needed))] = 1.0
-        return self._lu.solve(unit)[i, which.reshape(j.shape)]
+        which = which.reshape(-1)
+        order, rows = np.argsort(which, kind="stable"), i.reshape(-1)
+        result = np.empty(len(rows))
+        # Some columns at a time: all of them would be a dense matrix of all unknowns.
+        for begin in range(0, len(needed), _COLUMNS):
+            columns = needed[begin : begin + _COLUMNS]
+            unit = np.zeros((self._lu.shape[0], len(columns)))
+            unit[columns, np.arange(len(columns))] = 1.0
+            first, stop = np.searchsorted(which, [begin, begin + len(columns)], sorter=order)
+            here = order[first:stop]
+            result[here] = self._lu.solve(unit)[rows[here], which[here] - begin]
+        return result.reshape(j.shape)
 
     def diagonal(self) -> Array:
         columns = np.arange(self._lu.shape[0])

@@ -13,6 +13,9 @@ from torchspline.generate.sensors import SENSOR_PARAMETERS
 from torchspline.generate.trajectories import MOUNTINGS, REST, Mounting, motion_distributions
 from torchspline.io.yaml import read_yaml, short
 
+#: Readings and control points of an item; more would fill any memory.
+MOST = 10_000_000
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -45,9 +48,19 @@ class Recipe:
 
     def __post_init__(self) -> None:
         for name in ("duration", "rate", "knot_spacing"):
-            checks.positive(name, number_at(name, getattr(self, name)))
+            # As a number: YAML takes `1e3` for text.
+            object.__setattr__(self, name, checks.positive(name, number_at(name, getattr(self, name))))
         checks.choice("mounting", self.mounting, MOUNTINGS)
         checks.choice("dtype", self.dtype, ("float32", "float64"))
+        for name, count in (
+            ("rate", self.duration * self.rate),
+            ("knot_spacing", self.duration / self.knot_spacing),
+        ):
+            if count > MOST:
+                raise ValueError(
+                    f"{name}: expected at most {MOST} readings and as many control points in an item, got {count:.3g} "
+                    f"in {self.duration:g} s"
+                )
         if self.samples < 1:
             raise ValueError(
                 f"duration: {self.duration} s at {self.rate} Hz makes no reading; expected at least one"

@@ -4,6 +4,7 @@ import glob
 import hashlib
 import importlib.metadata
 import json
+import operator
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -119,10 +120,7 @@ class ShardedDataset(Dataset):
         folder = _path(folder)
         if not (folder / MANIFEST).is_file():
             raise FileNotFoundError(f"folder: expected {MANIFEST} in it, found none in {folder}")
-        self.manifest: dict[str, Any] = _read_manifest(folder / MANIFEST)
-        if self.manifest.get("format") != FORMAT:
-            got = short(repr(self.manifest.get("format")))
-            raise ValueError(f"folder: expected a data set of format {FORMAT!r} in {folder}, got {got}")
+        self.manifest = _read_manifest(folder)
         numbers = range(self.manifest["shards"])
         self.files = [folder / shard_name(shard) for shard in numbers]
         missing = [path.name for path in self.files if not path.is_file()]
@@ -140,6 +138,10 @@ class ShardedDataset(Dataset):
         return self.manifest["items"]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        try:
+            index = operator.index(index)
+        except TypeError:
+            raise TypeError(f"index: expected a whole number, got {type(index).__name__}") from None
         if not -len(self) <= index < len(self):
             raise IndexError(f"index: expected one below {len(self)}, got {index}")
         index %= len(self)
@@ -214,26 +216,33 @@ def _text(manifest: dict[str, Any]) -> str:
     return json.dumps(manifest, indent=2) + "\n"
 
 
-def _read_manifest(path: Path) -> dict[str, Any]:
+def _read_manifest(folder: Path) -> dict[str, Any]:
     """What `_text` wrote, of a size that agrees with itself."""
+    path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(manifest, dict):
-            raise ValueError(f"expected an object, got {type(manifest).__name__}")
-        if manifest.get("format") == FORMAT:
-            for name in ("items", "items_per_shard", "shards"):
-                checks.whole(name, manifest.get(name), least=1)  # type: ignore[arg-type]
-            if manifest["shards"] != -(-manifest["items"] // manifest["items_per_shard"]):
-                raise ValueError(f"shards: expected as many as items need, got {manifest['shards']}")
-    except (ValueError, RecursionError) as error:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # neither JSON nor text
+        raise ValueError(f"folder: {path} is damaged: {short(error)}; choose another folder") from None
+    name = found.get("format") if isinstance(found, dict) else found
+    if name != FORMAT:
+        got = short(repr(name))
+        raise ValueError(f"folder: expected a data set of format {FORMAT!r} in {folder}, got {got}")
+    try:
+        for name in ("items", "items_per_shard", "shards"):
+            checks.whole(name, found.get(name), least=1)
+    except (TypeError, ValueError) as error:
         raise ValueError(f"folder: {path} is damaged: {short(error)}") from None
-    return manifest
+    if found["shards"] != -(-found["items"] // found["items_per_shard"]):
+        raise ValueError(
+            f"folder: {path} is damaged: shards: expected as many as items need, got {found['shards']}"
+        )
+    return found
 
 
 def _agree(folder: Path, manifest: dict[str, Any]) -> None:
     if not (folder / MANIFEST).exists():
         return
-    there = _read_manifest(folder / MANIFEST)
+    there = _read_manifest(folder)
     different = [name for name in manifest | there if manifest.get(name) != there.get(name)]
     if different:
         name = different[0]
@@ -250,6 +259,8 @@ def _count(manifest: dict[str, Any], shard: int) -> int:
 
 def _is_complete(path: Path, manifest: dict[str, Any], shard: int) -> bool:
     """Whether the shard is there and readable; an error if it belongs to another data set."""
+    if path.exists() and not path.is_file():
+        raise ValueError(f"folder: expected {path} to be a file, got a folder; remove it")
     if not path.is_file():
         return False
     library = pyarrow()
