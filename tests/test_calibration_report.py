@@ -310,7 +310,7 @@ def test_the_command_calibrates(files, calibration):
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["command"] == "calibrate camera-imu"
-    assert "T_imu_cam1 position" in [row[0] for row in rows(calibration)]
+    assert "T_imu_cam1 position x y z" in [row[0] for row in rows(calibration)]
     assert sorted(x.name for x in (files / "out").iterdir()) == sorted(FILES)
     content = json.loads((files / "out" / "result.json").read_text())
     assert report["T_imu_cam1"] == content["T_imu_cam1"]
