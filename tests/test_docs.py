@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import torchspline
-from torchspline import calibrate, convert, functional, generate, imu, io, people, robot
+from torchspline import calibrate, convert, functional, generate, imu, io, people, plot, robot, view
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "experiments"))
 
@@ -74,7 +74,7 @@ def test_outputs_are_compared():
 #: Modules whose public names the reference has to have, and those names where there is no `__all__`.
 PUBLIC: dict[ModuleType, list[str] | None] = {
     torchspline: None, torchspline.fit: None, calibrate: None, functional: None, generate: None, imu: None, io: None,
-    robot: None,
+    plot: None, robot: None, view: None,
     imu.earth: ["earth_rate", "normal_gravity", "dipole_field", "standard_pressure"],
     people: ["fit_body", "response", "Response"],
 }  # fmt: skip
