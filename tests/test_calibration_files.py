@@ -245,6 +245,12 @@ def test_pickles_are_not_opened(folder):
             "imu0: accelerometer_noise_density: expected a finite number above",
         ),
         (lambda x: x["imu0"].update(g="earth"), "g: expected a number, got 'earth'"),
+        (lambda x: x["imu0"].update(g=-9.8), "g: expected a finite number above zero, got -9.8"),
+        (lambda x: x["imu0"].update(g=[9.8]), "g: expected a number, got [9.8]"),
+        (
+            lambda x: x["calib_target"].update(tag_cols=1e30),
+            "calib_target: tag_cols: expected the size of a board, got 1e+30",
+        ),
         (lambda x: x["calib_target"].pop("tag_size"), "tag_size: expected a number, got none"),
     ],
 )

@@ -36,6 +36,8 @@ _NOISE = {
     "accelerometer_random_walk": ("accelerometer_random_walk", "sigma_aw_c"),
 }
 _ON_BOARD = 1e-5
+#: Rows and columns of tags that a board may have.
+_MOST = 10_000
 
 Path_ = str | PathLike[str]
 
@@ -65,16 +67,15 @@ def read_recording(config: Path_, corners: Sequence[Path_], imus: Sequence[Path_
         _section(path, content, "cam", i, camera_from) for i in range(_count(path, content, "cam", corners))
     ]
     noises = [_section(path, content, "imu", i, _noise) for i in range(_count(path, content, "imu", imus))]
-    gravities = {content[f"imu{i}"].get("g", None) for i in range(len(imus))} - {None}
+    given = [content[f"imu{i}"].get("g") for i in range(len(imus))]
+    gravities = {checks.positive(f"{path}: g", number(f"{path}: g", g)) for g in given if g is not None}
     if len(gravities) > 1:
-        raise ValueError(
-            f"{path}: g: expected the same gravity for every IMU, got {sorted(map(str, gravities))}"
-        )
+        raise ValueError(f"{path}: g: expected the same gravity for every IMU, got {sorted(gravities)}")
     seen = [read_corners(x) for x in corners]
     if "calib_target" in content:
         for found in seen:
             _check_board(path, content["calib_target"], found)
-    gravity = {"gravity": number(f"{path}: g", gravities.pop())} if gravities else {}
+    gravity = {"gravity": gravities.pop()} if gravities else {}
     return Recording(tuple(cameras), tuple(seen), tuple(read_imu(x) for x in imus), tuple(noises), **gravity)
 
 
@@ -164,7 +165,7 @@ def _check_board(path: Path, target: Any, corners: Corners) -> None:
         raise ValueError(f"{path}: calib_target: {missing[0]}: expected a number, got none")
     rows, columns, size, spacing = (number(f"{path}: calib_target: {x}", target[x]) for x in names)
     for name, given in zip(names, (rows, columns, size, spacing), strict=True):
-        if not (math.isfinite(given) and given >= (1 if name in names[:2] else 0)):
+        if not (math.isfinite(given) and (1 <= given <= _MOST if name in names[:2] else given >= 0)):
             raise ValueError(f"{path}: calib_target: {name}: expected the size of a board, got {given:g}")
     if len(corners) == 0:
         return
