@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 from torch import Tensor
 
 from torchspline import checks
@@ -56,6 +55,8 @@ class AllanDeviation(NamedTuple):
         checks.number("confidence", confidence)
         if not 0.0 < confidence < 1.0:
             raise ValueError(f"confidence: expected a probability between 0 and 1, got {confidence}")
+        from scipy.special import gammaincinv  # late, as it takes long to import
+
         half = 0.5 * self.degrees.numpy()
         tails = 0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence
         upper, lower = (
