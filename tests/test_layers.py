@@ -13,7 +13,7 @@ MODULES = sorted((ROOT / PACKAGE).rglob("*.py"))
 
 # From the bottom to the top; those of one row stand side by side and do not import each other.
 LAYERS = [
-    {"checks", "errors"},
+    {"checks", "errors", "units"},
     {"arithmetic"},
     {"kernels"},
     {"groups"},

@@ -12,12 +12,12 @@ from torchspline import checks
 from torchspline.imu.parameters import ImuNoise
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
+from torchspline.units import SECOND
 
 #: Corners may lie as far outside of the image (px) as sub-pixel refinement may put them.
 _BEYOND = 2.0
 #: The board lies in its plane z = 0 up to this (m).
 _FLAT = 1e-6
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class Recording:
         checks.finite_number("start", start)
         if checks.finite_number("end", end) < start:
             raise ValueError(f"end: expected a time after start = {start:g} s, got {end:g}")
-        low, high = self.start_ns + round(start * _NS), self.start_ns + round(end * _NS)
+        low, high = self.start_ns + round(start * SECOND), self.start_ns + round(end * SECOND)
         corners = tuple(c.select((c.t_ns >= low) & (c.t_ns <= high)) for c in self.corners)
         return replace(self, corners=corners, imus=tuple(x.window(low, high) for x in self.imus))
 

@@ -16,6 +16,7 @@ from torchspline.calibrate.estimate import CalibratedImu, Calibration, SensorRes
 from torchspline.calibrate.report import CONVENTIONS, page, sensors
 from torchspline.groups.group import SE3
 from torchspline.io.camchain import CamChain, write_camchain
+from torchspline.units import NANOSECOND
 
 #: The files that `write_calibration` writes.
 FILES = ("result.json", "camchain-imucam.yaml", "report.html")
@@ -103,7 +104,7 @@ def results(calibration: Calibration, found: Coverage) -> dict[str, Any]:
         "trajectory": {
             "group": str(options.group),
             "order": options.order,
-            "spacing_s": None if options.dt_ns is None else options.dt_ns * 1e-9,
+            "spacing_s": None if options.dt_ns is None else options.dt_ns * NANOSECOND,
             "control_points": options.control_points.shape[-2],
         },
         "solver": {

@@ -18,9 +18,9 @@ from torchspline.groups.group import SE3
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
+from torchspline.units import SECOND
 
 Array = NDArray[Any]
-_NS = 1_000_000_000
 #: Fewest images with a board pose, and the largest share of images with corners that may contradict the board.
 _FEWEST_IMAGES, _MOST_MISFITS = 20, 0.3
 #: Share of corners far off in good images that is worth a note.
@@ -245,7 +245,7 @@ def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
 def _spline(recording: Recording, i: int, board: BoardPoses, notes: list[str]) -> BSpline:
     """Through the poses of the camera on the board, those that stray far from it left out."""
     t, poses = board.t_ns[board.good], SE3.inverse(board.T_cam_board[board.good])
-    dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / _NS, _SHORTEST_KNOT)
+    dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / SECOND, _SHORTEST_KNOT)
 
     def fit(t: Tensor, poses: Tensor) -> Any:
         options: dict[str, Any] = {"smoothness": _SMOOTHNESS, "max_iterations": 10, "tolerance": 1e-4}
@@ -366,5 +366,5 @@ def _poses(
 
 
 def _of_imu(board: BoardPoses, T_cam_imu: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    t = board.t_ns[board.good] + round(float(offset) * _NS)
+    t = board.t_ns[board.good] + round(float(offset) * SECOND)
     return t, SE3.compose(SE3.inverse(board.T_cam_board[board.good]), T_cam_imu)

@@ -13,11 +13,12 @@ from torchspline import checks
 from torchspline.fit import align_start
 from torchspline.fit.align_joint import FEWEST, Joint, Readings, Solution
 from torchspline.fit.losses import GemanMcClure, Loss
-from torchspline.fit.model import NANOSECOND, with_points
+from torchspline.fit.model import with_points
 from torchspline.fit.residual import needs
 from torchspline.groups.group import SO3
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 from torchspline.splines.bspline import BSpline
+from torchspline.units import NANOSECOND, nanoseconds
 
 Array = NDArray[Any]
 _MAGNITUDE = math.hypot(*STANDARD_GRAVITY)
@@ -74,9 +75,7 @@ class Alignment:
         s = (t - first).to(torch.float64) * (NANOSECOND if isinstance(first, int) else 1.0)
         mid = (self.t_mid - origin) * (NANOSECOND if isinstance(origin, int) else 1.0)
         tau = mid + (s - lag - mid) / (1.0 + self.clock_skew)
-        return (
-            origin + (tau / NANOSECOND).round().to(torch.int64) if isinstance(origin, int) else origin + tau
-        )
+        return origin + nanoseconds(tau) if isinstance(origin, int) else origin + tau
 
     @property
     def T_body_imu(self) -> Tensor:

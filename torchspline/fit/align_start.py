@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchspline.fit.model import NANOSECOND
 from torchspline.groups.group import SO3
 from torchspline.splines.bspline import BSpline
+from torchspline.units import NANOSECOND, nanoseconds
 
 Array = NDArray[Any]
 #: Angular speeds are compared at this interval (s), or that of the readings if longer, smoothed over two of them.
@@ -69,7 +69,7 @@ def times_of(trajectory: BSpline, tau: Array) -> torch.Tensor:
     """Times as the trajectory takes them, of seconds from the start of its domain."""
     start = trajectory.domain[0]
     x = torch.from_numpy(np.ascontiguousarray(tau))
-    return start + (x / NANOSECOND).round().to(torch.int64) if isinstance(start, int) else start + x
+    return start + nanoseconds(x) if isinstance(start, int) else start + x
 
 
 def length_of(trajectory: BSpline) -> float:

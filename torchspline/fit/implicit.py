@@ -14,13 +14,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchspline.fit.kernel import ResidualKernel
-from torchspline.fit.model import Model, State, seconds_of
+from torchspline.fit.model import Model, State
 from torchspline.fit.residual import square_root_information
 from torchspline.fit.system import Factor, SingularError, System
 from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.components import join, split
 from torchspline.splines.bspline import BSpline, bspline
+from torchspline.units import seconds_since
 
 if TYPE_CHECKING:
     from torchspline.fit.problem import Linearizer
@@ -190,7 +191,7 @@ def _of_term(term: Term, numbers: Numbers, given: Numbers) -> Tensor:
     def of(x: Tensor) -> Tensor:
         return given.get(id(x), x)
 
-    sensor = seconds_of(of(residual.t), term.origin).reshape(type(residual).moments, -1)
+    sensor = seconds_since(of(residual.t), term.origin).reshape(type(residual).moments, -1)
     tau = term.clocked(sensor, {key: x[0] for key, x in numbers.items() if x.ndim == 1}, of)
     vectors: list[Tensor] = []
     for moment in tau:

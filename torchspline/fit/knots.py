@@ -11,8 +11,8 @@ from torch import Tensor
 from torchspline.fit.banded import FloatArray, difference_band, gram_band, solve_band, transpose_apply
 from torchspline.splines.basis import blending_matrix, derivative_matrix
 from torchspline.splines.clock import locate
+from torchspline.units import NANOSECOND, SECOND, unit_of
 
-_NANOSECONDS = 1_000_000_000
 #: Spacings that are tried follow each other by this factor; fits two of them apart are compared.
 _RATIO = 2**0.25
 #: Fewest poses a knot interval that are tried, and knot intervals.
@@ -37,7 +37,7 @@ class Knots:
         self.order = order
         self.nanoseconds = times.dtype == torch.int64
         self.t0 = times[0].item()
-        self.dt: float | int = round(dt * _NANOSECONDS) if self.nanoseconds else float(dt)
+        self.dt: float | int = round(dt * SECOND) if self.nanoseconds else float(dt)
         if self.dt == 0:
             raise ValueError(f"dt: with int64 times expected at least a nanosecond, got {dt} s")
         span = times[-1].item() - self.t0
@@ -69,7 +69,7 @@ class Knots:
     @property
     def seconds(self) -> float:
         """The spacing."""
-        return self.dt * (1e-9 if self.nanoseconds else 1.0)
+        return self.dt * (NANOSECOND if self.nanoseconds else 1.0)
 
     def _basis(self, first: np.ndarray, u: FloatArray, derivative: int) -> FloatArray:
         """Weights (N, k) of the control points, for splines in R^n; derivatives per second."""
@@ -142,7 +142,7 @@ def choose_spacing(
         times: (N,) in order. measured: (N, 7) of continuous sign.
         accuracy: instead, the root mean square misses in m and rad, per axis, that the widest spacing may have.
     """
-    unit = 1e-9 if times.dtype == torch.int64 else 1.0
+    unit = unit_of(times)
     numbers = measured.numpy() * np.array([1.0] * 3 + [2.0] * 4)  # a turn by x moves a quaternion by x / 2
     steps = times.diff().to(torch.float64)
     steps = steps[steps > 0] * unit

@@ -15,10 +15,10 @@ from torchspline.fit.variables import Variable
 from torchspline.splines.basis import blending_matrix
 from torchspline.splines.bspline import BSpline
 from torchspline.splines.local import Local, LocalSpline
+from torchspline.units import NANOSECOND
 
 Array = NDArray[Any]
 Unknown = BSpline | Variable
-NANOSECOND = 1e-9
 
 
 class Spline:
@@ -69,13 +69,6 @@ def spacing_of(spline: BSpline) -> float:
 def seconds(t: float | int, origin: float | int) -> float:
     """A time, in the unit of the origin, as seconds from it."""
     return (t - origin) * NANOSECOND if isinstance(origin, int) else float(t - origin)
-
-
-def seconds_of(t: torch.Tensor, origin: float | int) -> torch.Tensor:
-    """The same of a tensor of times, float64."""
-    if t.dtype == torch.int64:
-        return (t - int(origin)).to(torch.float64) * NANOSECOND
-    return t.to(torch.float64) - origin
 
 
 def with_points(spline: BSpline, points: torch.Tensor) -> BSpline:

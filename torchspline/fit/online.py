@@ -11,7 +11,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.fit.bends import Bends
 from torchspline.fit.marginal import marginalised, normal_equations, random_walk
-from torchspline.fit.model import NANOSECOND, Model, Spline
+from torchspline.fit.model import Model, Spline
 from torchspline.fit.priors import Part, Prior
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Residual
@@ -23,6 +23,7 @@ from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
 from torchspline.splines.bspline import BSpline
 from torchspline.splines.local import LocalSpline
+from torchspline.units import NANOSECOND
 
 Array = NDArray[Any]
 #: Control points that one call may append: more is a time in the wrong unit or of another clock.

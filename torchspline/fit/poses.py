@@ -17,6 +17,7 @@ from torchspline.fit.solver import Options, minimise
 from torchspline.groups.group import R3, SE3, SO3, Group, product
 from torchspline.splines.bspline import BSpline, SplitBSpline
 from torchspline.splines.keyframes import consistent_signs
+from torchspline.units import NANOSECOND
 
 Representation = Literal["split", "joint"]
 
@@ -251,7 +252,7 @@ def _notes(
     if duplicates:
         notes.append(f"{duplicates} poses share their time with another; all were used")
     if gaps:
-        longest = max(b - a for a, b in gaps) * (1e-9 if knots.nanoseconds else 1.0)
+        longest = max(b - a for a, b in gaps) * (NANOSECOND if knots.nanoseconds else 1.0)
         notes.append(
             f"{len(gaps)} stretches of more than two knot intervals without poses, up to {longest:.3g} s, "
             "were bridged by smoothness"

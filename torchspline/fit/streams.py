@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchspline.fit.model import seconds_of
 from torchspline.fit.residual import Argument, Clock, Residual
 from torchspline.fit.variables import Variable
+from torchspline.units import seconds_since
 
 Array = NDArray[Any]
 _WEIGHTS = ("sigma", "covariance", "information")
@@ -65,7 +65,7 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
     (moments, N), seconds from the origin.
     """
     clock = residual.clock
-    t = seconds_of(residual.t.detach().cpu().reshape(type(residual).moments, -1), origin).numpy()
+    t = seconds_since(residual.t.detach().cpu().reshape(type(residual).moments, -1), origin).numpy()
     if not clock.unknowns:
         return t
     offset, skew, delay = (
@@ -78,7 +78,7 @@ def trajectory_times(residual: Residual, origin: float | int) -> Array:
                 f"clock: the skew of {residual.name} turns about the middle of the trajectory, which moves in "
                 "a window; expected Clock(mid=...)"
             )
-        mid = float(seconds_of(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
+        mid = float(seconds_since(torch.as_tensor(clock.mid, dtype=residual.t.dtype), origin))
     late = 0.0 if clock.late is None else delay * clock.late.detach().cpu().numpy()
     return mid + (t - mid - offset - late) / (1.0 + skew)
 

@@ -9,11 +9,12 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import Model, State, seconds, seconds_of
+from torchspline.fit.model import Model, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
+from torchspline.units import seconds_since
 
 Array = NDArray[Any]
 #: Measurements linearised at a time: their rows stay in the cache and memory stays bounded.
@@ -67,7 +68,7 @@ class Term:
     def __init__(self, residual: Residual, model: Model, origin: float | int, index: dict[str, Array]):
         self.residual, self.model, self.origin = residual, model, origin
         kind = type(residual)
-        tau = seconds_of(residual.t.detach().cpu().reshape(kind.moments, -1), origin).numpy()
+        tau = seconds_since(residual.t.detach().cpu().reshape(kind.moments, -1), origin).numpy()
         self.order = np.argsort(tau[0], kind="stable")
         self.tau = np.ascontiguousarray(tau[:, self.order])
         mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing

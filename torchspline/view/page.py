@@ -14,6 +14,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.plot.figure import named, times_of
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
 #: Directions that can point up in a view.
 UP = ("x", "y", "z", "-x", "-y", "-z")
@@ -91,7 +92,7 @@ def _curve(name: str, trajectory: Trajectory, samples: int) -> dict[str, Any]:
         raise ValueError(
             f"trajectories: expected single trajectories, got a batch of {tuple(motion.position.shape[:-2])}"
         )
-    seconds = (t - t[0]).double() / 1e9 if t.dtype == torch.int64 else t
+    seconds = (t - t[0]).double() / SECOND if t.dtype == torch.int64 else t
     curve: dict[str, Any] = {
         "name": name,
         "t": seconds.tolist(),
