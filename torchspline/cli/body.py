@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from torchspline.cli.common import NS
 from torchspline.cli.report import Report
 from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, read_bvh, write_imu
 from torchspline.people import fit_body, response
 from torchspline.plot import imu_comparison
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline body walk.bvh --rate 200 --out DIR
@@ -59,7 +59,7 @@ def body(
         made = measure(fitted, times, gravity)
     kept = response(torch.tensor([0.5 * bandwidth, bandwidth]).double(), frames, bandwidth=bandwidth)
     out.mkdir(parents=True, exist_ok=True)
-    stamps = (times * NS).round().to(torch.int64)
+    stamps = (times * SECOND).round().to(torch.int64)
     rows = []
     report = {}
     for j, name in enumerate(skeleton.names):

@@ -12,8 +12,7 @@ from torchspline.fit import PoseFit
 from torchspline.imu import ImuReading
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
 from torchspline.splines import Trajectory
-
-NS = 1_000_000_000
+from torchspline.units import SECOND
 
 
 def longest_stretch(record: PoseRecord, gap: float | None, start: float, duration: float) -> PoseRecord:
@@ -29,7 +28,7 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
         )
     steps = time.diff()
     median = steps.to(torch.float64).median().item()
-    largest = max(0.03 * NS, 3 * median) if gap is None else gap * 1e6
+    largest = max(0.03 * SECOND, 3 * median) if gap is None else gap * 1e6
     edges = [0, *(torch.nonzero(steps > largest).flatten() + 1).tolist(), len(time)]
     low, high = max(
         ((int(time[a]), int(time[b - 1])) for a, b in pairwise(edges)),
@@ -37,9 +36,9 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
     )
     if not (math.isfinite(start) and start >= 0):
         raise ValueError(f"start: expected seconds, zero or more, got {start}")
-    low += round(start * NS)
+    low += round(start * SECOND)
     if math.isfinite(duration):
-        high = min(high, low + round(duration * NS))
+        high = min(high, low + round(duration * SECOND))
     if low >= high:
         raise ValueError(
             f"start, duration: nothing is left of the longest stretch without a gap ({start=}, {duration=})"
@@ -49,7 +48,7 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
 
 def excerpt(stamps: Tensor, reading: ImuReading, shown: Tensor, origin: int) -> tuple[Tensor, ImuReading]:
     """Seconds since `origin` and readings of the samples `shown`."""
-    return (stamps[shown] - origin) / NS, ImuReading(*(x[shown] for x in reading))
+    return (stamps[shown] - origin) / SECOND, ImuReading(*(x[shown] for x in reading))
 
 
 def rmse(made: ImuReading, gyroscope: Tensor, accelerometer: Tensor) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from torchspline.cli.common import NS, excerpt, fit_report, fit_rows, rmse, write_results
+from torchspline.cli.common import excerpt, fit_report, fit_rows, rmse, write_results
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.groups import SO3
@@ -14,6 +14,7 @@ from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline demo
@@ -35,7 +36,7 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
     generator = torch.Generator().manual_seed(seed)
     truth = _random_motion(duration, generator)
     position_noise, rotation_noise = 1e-4, 5e-4
-    stamps = torch.arange(0, int(duration * NS), NS // 120)
+    stamps = torch.arange(0, int(duration * SECOND), SECOND // 120)
     exact = truth(stamps)
     noise = torch.randn(len(stamps), 6, generator=generator, dtype=torch.float64)
     rotations = SO3.retract(exact[:, 3:], rotation_noise * noise[:, 3:], side="right")
@@ -43,8 +44,8 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
 
     spacing = 0.1
     fit = fit_poses(stamps, torch.cat([poses.position, poses.rotation], -1), dt=spacing)
-    margin = int(0.3 * NS)
-    times = torch.arange(margin, int(stamps[-1]) - margin, NS // 200)
+    margin = int(0.3 * SECOND)
+    times = torch.arange(margin, int(stamps[-1]) - margin, SECOND // 200)
     with torch.no_grad():
         ideal, made = measure(truth, times), measure(fit.trajectory, times)
     errors = rmse(made, ideal.gyroscope, ideal.accelerometer)
@@ -55,7 +56,7 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
     write_poses(out / "poses.txt", poses)
     write_results(out, fit.trajectory, times, made)
     write_imu(out / "imu_truth.csv", ImuRecord(times, ideal.gyroscope, ideal.accelerometer, "demo"))
-    shown = times < margin + 10 * NS
+    shown = times < margin + 10 * SECOND
     figure = imu_comparison(
         excerpt(times, made, shown, 0),
         excerpt(times[::4], ImuReading(*(x[::4] for x in ideal)), shown[::4], 0),
@@ -94,4 +95,4 @@ def _random_motion(duration: float, generator: torch.Generator) -> SplitBSpline:
     for turn in turns[1:]:
         rotation.append(SO3.retract(rotation[-1], turn, side="right"))
     points = torch.cat([position, torch.stack(rotation)], dim=-1)
-    return SplitBSpline(points, order=order, dt_ns=int(knot * NS), t0_ns=0, learnable=False)
+    return SplitBSpline(points, order=order, dt_ns=int(knot * SECOND), t0_ns=0, learnable=False)

@@ -6,10 +6,11 @@ from typing import Literal
 
 import torch
 
-from torchspline.cli.common import NS, longest_stretch
+from torchspline.cli.common import longest_stretch
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.io import PoseRecord, read_nerfstudio, read_poses
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
 PoseFormat = Literal["tum", "euroc", "kitti", "ros", "nerfstudio"]
 
@@ -59,11 +60,11 @@ def sampled(trajectory: Trajectory, rate: float, source: str) -> PoseRecord:
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
     first, last = trajectory.domain
     nanoseconds = isinstance(first, int)
-    span = (last - first) / (NS if nanoseconds else 1)
+    span = (last - first) / (SECOND if nanoseconds else 1)
     if span * rate > 1e8:
         raise ValueError(f"rate: {rate:g} Hz over {span:g} s makes more than 1e8 poses")
     steps = torch.arange(int(span * rate + 1e-9) + 1, dtype=torch.float64) / rate
-    stamps = (steps * NS).round().to(torch.int64)
+    stamps = (steps * SECOND).round().to(torch.int64)
     t = first + stamps.clamp(max=last - first) if nanoseconds else (first + steps).clamp(first, last)
     with torch.no_grad():
         motion = trajectory.kinematics(t)
@@ -74,5 +75,5 @@ def sampled(trajectory: Trajectory, rate: float, source: str) -> PoseRecord:
         rotation = torch.zeros(len(t), 4, dtype=torch.float64)
         rotation[:, 0] = 1.0
     if not nanoseconds:
-        stamps = round(first * NS) + stamps
+        stamps = round(first * SECOND) + stamps
     return PoseRecord(t if nanoseconds else stamps, motion.position.double(), rotation.double(), source)

@@ -4,10 +4,11 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from torchspline.cli.common import NS, fit_report, fit_rows
+from torchspline.cli.common import fit_report, fit_rows
 from torchspline.cli.files import PoseFormat, fitted, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import save_trajectory
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline fit poses.txt                           # writes poses.npz
@@ -61,7 +62,7 @@ def fit(
         files.append(figure)
     dt_ns = found.trajectory.dt_ns
     assert dt_ns is not None  # the stamps are in nanoseconds
-    dt, span = dt_ns / NS, (int(used.time_ns[-1]) - int(used.time_ns[0])) / NS
+    dt, span = dt_ns / SECOND, (int(used.time_ns[-1]) - int(used.time_ns[0])) / SECOND
     rows = [("poses used", f"{len(used)} of {len(record)} over {span:.2f} s", ""), *fit_rows(found, dt)]
     values = {"poses_used": len(used), "duration_s": span, **fit_report(found, dt)}
     values.pop("notes")

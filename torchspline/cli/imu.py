@@ -8,12 +8,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchspline.cli.common import NS, excerpt, fit_report, fit_rows, longest_stretch, rmse, write_results
+from torchspline.cli.common import excerpt, fit_report, fit_rows, longest_stretch, rmse, write_results
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, read_imu, read_poses
 from torchspline.plot import imu_comparison
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline imu poses.txt --rate 200 --out DIR
@@ -65,7 +66,7 @@ def imu(
     recording = None if recorded is None else read_imu(recorded)
     record = longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
-    interval = record.time_ns.unique().diff().to(torch.float64).median().item() / NS
+    interval = record.time_ns.unique().diff().to(torch.float64).median().item() / SECOND
     dt = 5 * interval if spacing is None else spacing * 1e-3
     fit = fit_poses(
         record.time_ns,
@@ -75,26 +76,26 @@ def imu(
         representation=representation,
     )
     first, last = int(record.time_ns[0]), int(record.time_ns[-1])
-    low, high = first + round(margin * NS), last - round(margin * NS)
+    low, high = first + round(margin * SECOND), last - round(margin * SECOND)
     if low >= high:
         raise ValueError(
-            f"margin: nothing is left of {(last - first) / NS:.3g} s between margins of {margin} s"
+            f"margin: nothing is left of {(last - first) / SECOND:.3g} s between margins of {margin} s"
         )
-    if (high - low) / NS * rate > 1e9:
-        raise ValueError(f"rate: {rate:g} Hz over {(high - low) / NS:g} s makes more than 1e9 readings")
-    steps = torch.arange(int((high - low) / NS * rate) + 1, dtype=torch.float64)
-    stamps = low + (steps * (NS / rate)).round().to(torch.int64)
+    if (high - low) / SECOND * rate > 1e9:
+        raise ValueError(f"rate: {rate:g} Hz over {(high - low) / SECOND:g} s makes more than 1e9 readings")
+    steps = torch.arange(int((high - low) / SECOND * rate) + 1, dtype=torch.float64)
+    stamps = low + (steps * (SECOND / rate)).round().to(torch.int64)
     with torch.no_grad():
         made = measure(fit.trajectory, stamps, gravity)
 
     rows = [
-        ("poses used", f"{len(record)} over {(last - first) / NS:.2f} s", ""),
+        ("poses used", f"{len(record)} over {(last - first) / SECOND:.2f} s", ""),
         *fit_rows(fit, dt),
         ("readings synthesised", f"{len(stamps)} at {rate:g} Hz", ""),
     ]
     report: dict = {"fit": fit_report(fit, dt), "window_ns": [first, last]}
     title = f"{poses.name}: {representation} spline of order {order}, knots {dt * 1e3:.4g} ms apart"
-    shown = stamps < low + 10 * NS
+    shown = stamps < low + 10 * SECOND
     lines, dots = excerpt(stamps, made, shown, first), None
     if recording is not None:
         within = recording.window(low, high)
@@ -124,7 +125,7 @@ def imu(
             ("gyroscope RMSE", f"{errors[0]:.4f}", "rad/s"),
             ("accelerometer RMSE", f"{errors[1]:.4f}", "m/s²"),
         ]
-        early = within.time_ns < low + 10 * NS
+        early = within.time_ns < low + 10 * SECOND
         lines = lines[0], ImuReading(lines[1].gyroscope + bias[0], lines[1].accelerometer + bias[1])
         dots = excerpt(within.time_ns, ImuReading(within.gyroscope, within.accelerometer), early, first)
         _write_comparison(out / "comparison.csv", within, biased)

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchspline.cli.common import NS
 from torchspline.cli.files import is_trajectory, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import ImuRecord, PoseRecord, load_trajectory, read_imu
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline info poses.txt
@@ -67,10 +67,10 @@ def _of_record(
     for x, _ in columns.values():
         bad |= ~x.isfinite().all(-1)
     distinct = stamps.unique()
-    steps = distinct.diff().double() / NS
+    steps = distinct.diff().double() / SECOND
     interval = float(steps.median()) if len(steps) else float("nan")
     gaps = steps[steps > 3 * interval]
-    span = (int(distinct[-1]) - int(distinct[0])) / NS if len(distinct) else 0.0
+    span = (int(distinct[-1]) - int(distinct[0])) / SECOND if len(distinct) else 0.0
     values: dict[str, Any] = {
         "rows": len(stamps),
         "first_ns": int(distinct[0]) if len(distinct) else None,
@@ -116,7 +116,7 @@ def _of_trajectory(trajectory: Trajectory) -> tuple[dict[str, Any], list[tuple[s
     first, last = trajectory.domain
     nanoseconds = isinstance(first, int)
     unit = "ns" if nanoseconds else "s"
-    span = (last - first) / (NS if nanoseconds else 1)
+    span = (last - first) / (SECOND if nanoseconds else 1)
     tensors = [*trajectory.named_parameters(), *trajectory.named_buffers()]
     values: dict[str, Any] = {
         "family": type(trajectory).__name__,

@@ -6,11 +6,11 @@ from typing import Literal
 
 import torch
 
-from torchspline.cli.common import NS
 from torchspline.cli.files import PoseFormat, fitted, is_trajectory, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import load_trajectory
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 from torchspline.view import write_page
 
 EXAMPLES = """
@@ -70,7 +70,7 @@ def view(
 
         webbrowser.open(target.resolve().as_uri())
     first, last = trajectory.domain
-    span = (last - first) / (NS if isinstance(first, int) else 1)
+    span = (last - first) / (SECOND if isinstance(first, int) else 1)
     size = target.stat().st_size
     rows = [("duration", f"{span:.6g}", "s"), ("size of the page", f"{size / 1e6:.3g}", "MB")]
     values = {

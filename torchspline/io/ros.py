@@ -16,9 +16,9 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.io.archive import check_folder
 from torchspline.io.records import ImuRecord, PoseRecord
+from torchspline.units import SECOND
 
 NAME = "ros"
-_NS = 1_000_000_000
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _IMU = ("sensor_msgs/msg/Imu",)
 #: Messages with one stamped pose, and where it is in them.
@@ -112,7 +112,7 @@ def _written(record: PoseRecord | ImuRecord, make: Mapping[str, Any]) -> Iterato
     else:
         imu, columns = False, (record.position, record.rotation)
     for time_ns, first, second in zip(record.time_ns.tolist(), *(x.tolist() for x in columns), strict=True):
-        stamp = make["Time"](*divmod(time_ns, _NS))
+        stamp = make["Time"](*divmod(time_ns, SECOND))
         if imu:
             header = make["Header"](stamp, _SENSOR)
             nowhere = quaternion(0.0, 0.0, 0.0, 1.0)
@@ -141,7 +141,7 @@ def _check_records(records: Mapping[str, PoseRecord | ImuRecord]) -> None:
             raise TypeError(f"records[{topic!r}]: expected a PoseRecord or an ImuRecord, got {got}")
         if len(record) == 0:
             raise ValueError(f"records[{topic!r}]: expected rows to write, got an empty record")
-        outside = (record.time_ns < 0) | (record.time_ns >= 2**31 * _NS)
+        outside = (record.time_ns < 0) | (record.time_ns >= 2**31 * SECOND)
         if bool(outside.any()):
             raise ValueError(
                 f"records[{topic!r}]: expected stamps between 1970 and 2038, as messages of ROS hold them, got "
@@ -151,7 +151,7 @@ def _check_records(records: Mapping[str, PoseRecord | ImuRecord]) -> None:
 
 def _stamp(message: Any) -> int:
     stamp = message.header.stamp
-    return stamp.sec * _NS + stamp.nanosec
+    return stamp.sec * SECOND + stamp.nanosec
 
 
 def _columns(rows: Sequence[tuple[int, tuple[float, ...]]], width: int) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchspline.io.archive import read_bytes
+from torchspline.units import SECOND
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -45,7 +46,7 @@ def parse_seconds(field: str) -> int:
 
 def format_seconds(time_ns: int) -> str:
     """Decimal seconds with nine digits, exactly."""
-    whole, fraction = divmod(abs(time_ns), 10**9)
+    whole, fraction = divmod(abs(time_ns), SECOND)
     return f"{'-' if time_ns < 0 else ''}{whole}.{fraction:09d}"
 
 
