@@ -1,15 +1,15 @@
 """Where a camera sees a landmark, in pixels."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
-from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
+from torchspline.arithmetic.motion import Motion, sighted, sighted_reverse
 from torchspline.arithmetic.scalar import Scalar, sqrt, where
 from torchspline.arithmetic.series import arctan_factor
 from torchspline.arithmetic.vector import Vector, add, dot, negate, scale, times
-from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Slot
+from torchspline.fit.residuals.motion import MotionResidual
 
 #: (tan 89.94 degrees)^-2: a pinhole sees nothing that lies so far aside.
 _ASIDE = 1e-6
@@ -17,7 +17,7 @@ _ASIDE = 1e-6
 _BEHIND = 0.97
 
 
-class _Reprojection(Residual):
+class _Reprojection(MotionResidual):
     rows, measured_size, derivatives = 2, 2, 0
     slots: ClassVar = {
         "landmark": Slot(3, None, None),
@@ -40,28 +40,18 @@ class _Reprojection(Residual):
     def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
         """Cotangents of the point and of the coefficients."""
 
-    def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
-    ) -> Vector:
-        motion, camera = MOTIONS[group.name].motion(at[0].value, ()), given["intrinsics"]
-        seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self._visible(seen)
+    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+        camera = given["intrinsics"]
+        point, shown = self._visible(sighted(motion, given["T_body_camera"], given["landmark"]))
         x, y = self._distort(point, camera[4:])
         pixel = (times(camera[0], x), times(camera[1], y))
         return scale(shown, add(pixel, camera[2:4], negate(measured)))
 
-    def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
-        mechanics, camera = MOTIONS[group.name], given["intrinsics"]
-        motion = mechanics.motion(at[0].value, ())
-        seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self._visible(seen)
+    def error_reverse(
+        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
+    ) -> tuple[Motion, dict[str, Vector]]:
+        camera = given["intrinsics"]
+        point, shown = self._visible(sighted(motion, given["T_body_camera"], given["landmark"]))
         x, y = self._distort(point, camera[4:])
         gu, gv = scale(shown, g)
         plane_g = (times(camera[0], gu), times(camera[1], gv))
@@ -69,13 +59,8 @@ class _Reprojection(Residual):
         motion_g, T_g, landmark_g = sighted_reverse(
             motion, given["T_body_camera"], given["landmark"], point_g
         )
-        value_g, _ = mechanics.reverse(at[0].value, (), motion, motion_g)
         intrinsics_g = (times(x, gu), times(y, gv), gu, gv, *k_g)
-        return [Moment(value_g, ())], {
-            "landmark": landmark_g,
-            "intrinsics": intrinsics_g,
-            "T_body_camera": T_g,
-        }
+        return motion_g, {"landmark": landmark_g, "intrinsics": intrinsics_g, "T_body_camera": T_g}
 
 
 class ReprojectionRadtan(_Reprojection):
