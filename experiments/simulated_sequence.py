@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from simulated.baseline import baseline
 from simulated.sequences import Sequence, make_sequence, read_sequence
 
-from torchspline.fit.problem import Linearizer
+from torchspline.fit.linearizer import Linearizer
 from torchspline.fit.solver import Options, minimise
 from torchspline.fit.terms import Term
 

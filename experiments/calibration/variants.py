@@ -17,8 +17,8 @@ from torch import Tensor
 from torchspline.arithmetic.recurrence import forward
 from torchspline.calibrate.problem import Layout
 from torchspline.fit.kernel import ResidualKernel
+from torchspline.fit.linearizer import Linearizer
 from torchspline.fit.model import State
-from torchspline.fit.problem import Linearizer
 from torchspline.fit.solver import Options, minimise
 from torchspline.fit.system import Rows, System
 from torchspline.fit.terms import Term

@@ -1,6 +1,6 @@
 """Regularisation of a trajectory's own control points: differences of the logarithms of neighbours."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class Bends:
         """Columns of the unknowns of each run."""
         return self.columns
 
-    def cost_of(self, numbers: dict[int, torch.Tensor]) -> torch.Tensor:
+    def cost_of(self, numbers: Mapping[int, torch.Tensor], given: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """The cost as differentiable operations."""
         group, points = self.module.group, numbers[id(self.module)]
         logs = group.log(group.between(points[:-1], points[1:], validate=False), validate=False)
@@ -49,10 +49,7 @@ class Bends:
 
     def add_to(self, system: System, state: State) -> None:
         """Add cost and normal equations."""
-        assert state.chain is not None
-        for cost, rows, _ in self.linearize(state):
-            system.cost += cost
-            system.add(rows, state.chain)
+        system.add_all(self.linearize(state), state)
 
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows and residuals, chunk by chunk."""

@@ -6,7 +6,7 @@ on the exact Hessian with the Gauss-Newton factor of the solution as preconditio
 zero), and then multiplied by the mixed derivative, which automatic differentiation of the reference gives.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,17 +14,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchspline.fit.kernel import ResidualKernel
+from torchspline.fit.linearizer import Linearizer
 from torchspline.fit.model import Model, State
-from torchspline.fit.residual import square_root_information
 from torchspline.fit.system import Factor, SingularError, System
-from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.components import join, split
-from torchspline.splines.bspline import BSpline, bspline
-from torchspline.units import seconds_since
-
-if TYPE_CHECKING:
-    from torchspline.fit.problem import Linearizer
 
 #: Conjugate gradients stop at this relative residual, or after so many steps.
 _ACCURACY, _STEPS = 1e-13, 100
@@ -32,13 +26,13 @@ _ACCURACY, _STEPS = 1e-13, 100
 Numbers = dict[int, Tensor]
 
 
-def differentiable(linearizer: "Linearizer", state: State, system: System) -> Numbers:
+def differentiable(linearizer: Linearizer, state: State, system: System) -> Numbers:
     """Numbers of all unknowns at the solution, by `id`, as functions of the tensors with gradients that residuals hold.
 
     Raises:
         ValueError: nothing requires grad; the solution is not determined.
     """
-    for term in _terms(linearizer):
+    for term in linearizer.measured:
         if not isinstance(term.kernel, ResidualKernel):
             raise ValueError(
                 f"differentiable: {term.residual.name} sums up its measurements and has no automatic derivatives; "
@@ -63,10 +57,10 @@ def differentiable(linearizer: "Linearizer", state: State, system: System) -> Nu
     return dict(zip(keys, numbers, strict=True))
 
 
-def _inputs(linearizer: "Linearizer") -> list[Tensor]:
+def _inputs(linearizer: Linearizer) -> list[Tensor]:
     """The tensors that require grad among what residuals were made of, each once."""
     found: dict[int, Tensor] = {}
-    for term in _terms(linearizer):
+    for term in linearizer.measured:
         residual = term.residual
         arguments = [x for x in residual.arguments.values() if isinstance(x, Tensor)]
         for x in (residual.t, residual.measured, residual.weighting[1], residual.clock.late, *arguments):
@@ -75,16 +69,12 @@ def _inputs(linearizer: "Linearizer") -> list[Tensor]:
     return list(found.values())
 
 
-def _terms(linearizer: "Linearizer") -> list[Term]:
-    return [term for term in linearizer.terms if isinstance(term, Term)]
-
-
 class _Optimum(torch.autograd.Function):
     """Unknowns at the solution, from the tensors that the problem was made of."""
 
     @staticmethod
     def forward(
-        ctx: Any, linearizer: "Linearizer", state: State, factor: Factor, *tensors: Tensor
+        ctx: Any, linearizer: Linearizer, state: State, factor: Factor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         ctx.linearizer, ctx.state, ctx.factor = linearizer, state, factor
         ctx.ids = [id(x) for x in tensors]
@@ -175,69 +165,8 @@ def _solve(slope: Tensor, step: Tensor, factor: Factor, v: Tensor) -> Tensor:
     return x
 
 
-# ---------------------------------------------------------------------- the cost as differentiable operations
-
-
-def _cost(linearizer: "Linearizer", numbers: Numbers, given: Numbers) -> Tensor:
+def _cost(linearizer: Linearizer, numbers: Numbers, given: Numbers) -> Tensor:
     total = torch.zeros((), dtype=torch.float64)
     for term in linearizer.terms:
-        total = total + (_of_term(term, numbers, given) if isinstance(term, Term) else term.cost_of(numbers))
+        total = total + term.cost_of(numbers, given)
     return total
-
-
-def _of_term(term: Term, numbers: Numbers, given: Numbers) -> Tensor:
-    residual, trajectory = term.residual, term.model.trajectory
-
-    def of(x: Tensor) -> Tensor:
-        return given.get(id(x), x)
-
-    sensor = seconds_since(of(residual.t), term.origin).reshape(type(residual).moments, -1)
-    tau = term.clocked(sensor, {key: x[0] for key, x in numbers.items() if x.ndim == 1}, of)
-    vectors: list[Tensor] = []
-    for moment in tau:
-        state = bspline(
-            numbers[id(trajectory.module)],
-            moment,
-            group=trajectory.module.group,
-            order=trajectory.order,
-            dt=trajectory.spacing,
-            derivatives=type(residual).derivatives,
-            extrapolate="clamp",
-            validate=False,
-        )
-        vectors += [x for x in state if x is not None]
-    vectors.append(of(residual.measured).to(torch.float64))
-    for slot in term.kernel.order:
-        x = residual.arguments[slot]
-        if isinstance(x, BSpline):
-            spline = term.splines[slot]
-            places = sensor[0] - spline.start
-            own = bspline(
-                numbers[id(x)],
-                places,
-                group=x.group,
-                order=x.order,
-                dt=spline.spacing,
-                derivatives=0,
-                extrapolate="clamp",
-                validate=False,
-            ).value
-        else:
-            own = numbers[id(x)] if isinstance(x, Variable) else of(x).to(torch.float64)
-            if slot in term.index:
-                back = np.empty_like(term.order)
-                back[term.order] = np.arange(len(back))
-                own = own[torch.from_numpy(term.index[slot][back])]
-        vectors.append(own)
-    assert isinstance(term.kernel, ResidualKernel)
-    error = term.kernel.on_tensors(*vectors)
-    kind, weights = residual.weighting
-    root = square_root_information((kind, None if weights is None else of(weights)))
-    if root is not None:
-        matrix = kind != "sigma"
-        error = (root @ error.unsqueeze(-1)).squeeze(-1) if matrix else root * error
-    squared = error.square().sum(-1)
-    end = trajectory.segments * trajectory.spacing
-    inside = ((tau.detach() >= -1e-9 * end) & (tau.detach() <= end * (1 + 1e-9))).all(0)
-    rho = squared if residual.loss is None else residual.loss.rho(squared)
-    return 0.5 * torch.where(inside, rho, 0.0).sum()

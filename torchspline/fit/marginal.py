@@ -6,18 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.bends import Bends
+from torchspline.fit.linearizer import CostTerm
 from torchspline.fit.model import Model, State
-from torchspline.fit.priors import BoundPrior
 from torchspline.fit.system import BandSystem
-from torchspline.fit.terms import Term
 
 Array = NDArray[Any]
 
 
-def normal_equations(
-    model: Model, terms: Sequence[Term | Bends | BoundPrior], state: State
-) -> tuple[Array, Array]:
+def normal_equations(model: Model, terms: Sequence[CostTerm], state: State) -> tuple[Array, Array]:
     """`J^T J` (total, total) and `J^T r` (total,) of a few unknowns, dense."""
     system = BandSystem(model, model.trajectory.local.fused, model.band)
     for term in terms:

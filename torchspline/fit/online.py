@@ -13,7 +13,7 @@ from torchspline.fit.bends import Bends
 from torchspline.fit.marginal import marginalised, normal_equations, random_walk
 from torchspline.fit.model import Model, Spline
 from torchspline.fit.priors import Part, Prior
-from torchspline.fit.problem import Problem
+from torchspline.fit.problem import Problem, include_unknowns
 from torchspline.fit.residual import Residual
 from torchspline.fit.result import Result
 from torchspline.fit.solver import Options, minimise
@@ -177,7 +177,7 @@ class SlidingWindow:
             more = self._beyond("t", last)
         # A problem of its own tells what is wrong before anything changes.
         probe = Problem(self._spline(self._first, self._count, more))
-        probe._know(list(self._variables.values()))
+        include_unknowns(probe, list(self._variables.values()))
         probe.add(residual, **index)
         self._append(more)
         self._variables.update({v.name: v for v in variables_of(residual)})
@@ -218,7 +218,7 @@ class SlidingWindow:
     ) -> None:
         """Say beforehand how far a variable may be from where it stands now; see `Problem.add_prior`."""
         probe = Problem(self._anchor)
-        probe._know(list(self._variables.values()))
+        include_unknowns(probe, list(self._variables.values()))
         probe.add_prior(variable, sigma=sigma, covariance=covariance, information=information)
         self._variables[variable.name] = variable
         self._priors += probe.priors
@@ -315,7 +315,7 @@ class SlidingWindow:
             for stream in self._streams:
                 problem.add(stream.residual, **stream.which)
             for prior in self._priors_on(spline):
-                problem._know([part.unknown for part in prior.parts])
+                include_unknowns(problem, [part.unknown for part in prior.parts])
                 problem.priors.append(prior)
             linearizer = problem.prepare()
             linearizer.terms.append(Bends(linearizer.model, self._stiffness))

@@ -1,5 +1,6 @@
 """What is known of unknowns beforehand, or remembered of measurements that were dropped: Gaussians on unknowns."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,7 +52,7 @@ class BoundPrior:
         """Columns of the unknowns, one run."""
         return self.columns[None]
 
-    def cost_of(self, numbers: dict[int, torch.Tensor]) -> torch.Tensor:
+    def cost_of(self, numbers: Mapping[int, torch.Tensor], given: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """The cost as differentiable operations."""
         steps = []
         for part in self.prior.parts:

@@ -25,6 +25,7 @@ from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
 from torchspline.splines.bspline import BSpline
 
+_WEIGHTS = ("sigma", "covariance", "information")
 #: What may stand for an unknown: the unknown itself, a spline of it over time, or its known value.
 Argument = Variable | BSpline | Tensor
 
@@ -301,6 +302,13 @@ def weighting_of(
         where = torch.nonzero(failed.reshape(-1))[0].item()
         raise ValueError(f"{name}: expected positive definite matrices, the one at index {where} is not")
     return name, x
+
+
+def set_weighting(residual: Residual, kind: str, x: Tensor | None) -> None:
+    """Give a residual another weight, one that `weighting_of` would find good."""
+    residual.weighting = kind, x
+    sigma, covariance, information = (x if kind == name else None for name in _WEIGHTS)
+    residual._weights = sigma, covariance, information
 
 
 def square_root_information(weighting: tuple[str, Tensor | None]) -> Tensor | None:

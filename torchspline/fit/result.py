@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,16 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.fit.linearizer import Linearizer
 from torchspline.fit.model import State, Unknown
 from torchspline.fit.scatter import scatter
 from torchspline.fit.solver import Trace
 from torchspline.fit.system import BandSystem, Factor, SingularError, System
-from torchspline.fit.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
-
-if TYPE_CHECKING:
-    from torchspline.fit.problem import Linearizer
 
 Array = NDArray[Any]
 #: Eigenvalues of the normal equations, scaled to a diagonal of ones, below which a direction counts as left open: its
@@ -50,7 +47,7 @@ class Result:
 
     def __init__(
         self,
-        linearizer: "Linearizer",
+        linearizer: Linearizer,
         state: State,
         system: System,
         trace: Trace,
@@ -91,7 +88,7 @@ class Result:
         A second residual of one name gets " 2" after it, and so on.
         """
         found: dict[str, Tensor] = {}
-        for term in self._terms():
+        for term in self._linearizer.measured:
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
@@ -101,15 +98,12 @@ class Result:
     @cached_property
     def outside(self) -> int:
         """Measurements that an estimated clock moved out of the trajectory's domain; they had no weight."""
-        return sum(int(term.places(self._state).outside.sum()) for term in self._terms())
-
-    def _terms(self) -> list[Term]:
-        return [term for term in self._linearizer.terms if isinstance(term, Term)]
+        return sum(int(term.places(self._state).outside.sum()) for term in self._linearizer.measured)
 
     @property
     def variance_factor(self) -> float:
         """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
-        rows = sum(term.numbers for term in self._terms())
+        rows = sum(term.numbers for term in self._linearizer.measured)
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
     @cached_property
@@ -124,7 +118,7 @@ class Result:
             ValueError: the measurements do not determine all unknowns.
         """
         factor, found = self._determined(), {}
-        for name, term in zip(self.residuals, self._terms(), strict=True):
+        for name, term in zip(self.residuals, self._linearizer.measured, strict=True):
             own = self._linearizer.system_of(term, self._state)
             found[name] = term.numbers - factor.trace(own)
         return found

@@ -1,23 +1,21 @@
 """What each stretch of a trajectory would move variables by: how sure they are when errors are alike for a while."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchspline.fit.linearizer import Linearizer
 from torchspline.fit.model import State
 from torchspline.fit.system import BandFactor, Factor
 from torchspline.fit.terms import Term
-
-if TYPE_CHECKING:
-    from torchspline.fit.problem import Linearizer
 
 Array = NDArray[Any]
 #: Fewest stretches whose scatter says anything.
 _FEWEST = 6
 
 
-def scatter(linearizer: "Linearizer", state: State, factor: Factor, seconds: float) -> Array:
+def scatter(linearizer: Linearizer, state: State, factor: Factor, seconds: float) -> Array:
     """Rows `(stretches, border)` whose squares sum up to variances of the variables.
 
     At the optimum x = -H^-1 g, and g is the sum of the gradients g_b of the stretches, which cancel there. How far they
@@ -36,9 +34,8 @@ def scatter(linearizer: "Linearizer", state: State, factor: Factor, seconds: flo
     # Stretches much shorter than measurements are apart would say no more, and be too many to hold.
     count = max(round(min(length / seconds, model.trajectory.segments)), _FEWEST)
     pulls = np.zeros((count, model.total - model.band))
-    for term in linearizer.terms:
-        if isinstance(term, Term):
-            _add_pulls(term, state, factor, length, pulls)
+    for term in linearizer.measured:
+        _add_pulls(term, state, factor, length, pulls)
     return pulls * np.sqrt(count / (count - 1))
 
 

@@ -8,12 +8,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchspline.fit.residual import Argument, Clock, Residual
+from torchspline.fit.residual import Argument, Clock, Residual, set_weighting
 from torchspline.fit.variables import Variable
 from torchspline.units import seconds_since
 
 Array = NDArray[Any]
-_WEIGHTS = ("sigma", "covariance", "information")
 #: What a residual may have for each of its measurements.
 _EACH = {"t", "measured", "arguments", "clock", "weighting", "_weights"}
 
@@ -34,7 +33,7 @@ class Stream(NamedTuple):
         new.arguments = {slot: _of_each(x, chosen) for slot, x in old.arguments.items()}
         kind, x = old.weighting
         if x is not None and _weighs_each(kind, x):
-            _weigh(new, kind, x[chosen])
+            set_weighting(new, kind, x[chosen])
         return Stream(new, {slot: i[chosen] for slot, i in self.which.items()})
 
     def join(self, other: "Stream") -> "Stream | None":
@@ -131,23 +130,18 @@ def _weighs_each(kind: str, x: Tensor) -> bool:
     return x.ndim == (2 if kind == "sigma" else 3)
 
 
-def _weigh(residual: Residual, kind: str, x: Tensor | None) -> None:
-    residual.weighting = kind, x
-    residual._weights = tuple(x if name == kind else None for name in _WEIGHTS)  # type: ignore[assignment]
-
-
 def _join_weights(new: Residual, first: Residual, second: Residual) -> bool:
     """One weight for all where it is the same, else one for each measurement; False where neither goes."""
     (kind, x), (other, y) = first.weighting, second.weighting
     if kind != other or (x is None) != (y is None):
         return False
     if x is None or y is None or (not _weighs_each(kind, x) and _same(x, y)):
-        _weigh(new, kind, x)
+        set_weighting(new, kind, x)
         return True
     each = [
         w if _weighs_each(kind, w) else w.expand(len(r), *(w.shape or (1,)))
         for w, r in ((x, first), (y, second))
     ]
     width = max(w.shape[-1] for w in each)
-    _weigh(new, kind, torch.cat([w.expand(*w.shape[:-1], width).to(each[0]) for w in each]))
+    set_weighting(new, kind, torch.cat([w.expand(*w.shape[:-1], width).to(each[0]) for w in each]))
     return True

@@ -4,13 +4,14 @@
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.model import Model
+from torchspline.fit.model import Model, State
 from torchspline.kernels.assemble import add_to_band, add_to_blocks
 from torchspline.kernels.band import inverse_band
 
@@ -72,6 +73,13 @@ class System(ABC):
     @abstractmethod
     def add(self, rows: Rows, chain: Array) -> None:
         """The rows of a chunk."""
+
+    def add_all(self, chunks: Iterable[tuple[float, Rows, Array]], state: State) -> None:
+        """Cost and rows of all chunks of a term; residuals come along."""
+        assert state.chain is not None
+        for cost, rows, _ in chunks:
+            self.cost += cost
+            self.add(rows, state.chain)
 
     @abstractmethod
     def add_dense(self, columns: Array, matrix: Array, right: Array) -> None:

@@ -1,7 +1,7 @@
 """One residual inside a problem: its measurements in order of time, and its part of the normal equations."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,11 +9,12 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import Model, State, seconds
+from torchspline.fit.model import Model, Spline, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
 from torchspline.fit.system import Rows, System
 from torchspline.fit.variables import Variable
-from torchspline.splines.bspline import BSpline
+from torchspline.splines.bspline import BSpline, bspline
+from torchspline.splines.trajectory import State as SplineState
 from torchspline.units import seconds_since
 
 Array = NDArray[Any]
@@ -217,10 +218,7 @@ class Term:
 
     def add_to(self, system: System, state: State) -> None:
         """Add cost and normal equations."""
-        assert state.chain is not None
-        for cost, rows, _ in self.linearize(state):
-            system.cost += cost
-            system.add(rows, state.chain)
+        system.add_all(self.linearize(state), state)
 
     def linearize(self, state: State) -> Iterator[tuple[float, Rows, Array]]:
         """Cost, rows of the Jacobian, and residuals (unweighted, in order of time), chunk by chunk."""
@@ -301,6 +299,56 @@ class Term:
         result = np.empty_like(rows)
         result[self.order] = rows
         return result
+
+    def cost_of(self, numbers: Mapping[int, torch.Tensor], given: Mapping[int, torch.Tensor]) -> torch.Tensor:
+        """The cost as differentiable operations of the numbers of unknowns and of what the residual was made of."""
+        residual, trajectory = self.residual, self.model.trajectory
+
+        def of(x: torch.Tensor) -> torch.Tensor:
+            return given.get(id(x), x)
+
+        sensor = seconds_since(of(residual.t), self.origin).reshape(type(residual).moments, -1)
+        tau = self.clocked(sensor, {key: x[0] for key, x in numbers.items() if x.ndim == 1}, of)
+        vectors: list[torch.Tensor] = []
+        for moment in tau:
+            state = self._on_spline(trajectory, numbers, moment, type(residual).derivatives)
+            vectors += [x for x in state if x is not None]
+        vectors.append(of(residual.measured).to(torch.float64))
+        for slot in self.kernel.order:
+            x = residual.arguments[slot]
+            if isinstance(x, BSpline):
+                spline = self.splines[slot]
+                vectors.append(self._on_spline(spline, numbers, sensor[0] - spline.start, 0).value)
+                continue
+            own = numbers[id(x)] if isinstance(x, Variable) else of(x).to(torch.float64)
+            if slot in self.index:
+                back = np.empty_like(self.order)
+                back[self.order] = np.arange(len(back))
+                own = own[torch.from_numpy(self.index[slot][back])]
+            vectors.append(own)
+        assert isinstance(self.kernel, ResidualKernel)
+        error = self.kernel.on_tensors(*vectors)
+        kind, weights = residual.weighting
+        root = square_root_information((kind, None if weights is None else of(weights)))
+        if root is not None:
+            matrix = kind != "sigma"
+            error = (root @ error.unsqueeze(-1)).squeeze(-1) if matrix else root * error
+        squared = error.square().sum(-1)
+        end = trajectory.segments * trajectory.spacing
+        inside = ((tau.detach() >= -1e-9 * end) & (tau.detach() <= end * (1 + 1e-9))).all(0)
+        rho = squared if residual.loss is None else residual.loss.rho(squared)
+        return 0.5 * torch.where(inside, rho, 0.0).sum()
+
+    @staticmethod
+    def _on_spline(
+        spline: Spline, numbers: Mapping[int, torch.Tensor], t: torch.Tensor, derivatives: int
+    ) -> SplineState:
+        """State of a spline at seconds from its start."""
+        module = spline.module
+        return bspline(
+            numbers[id(module)], t, group=module.group, order=spline.order, dt=spline.spacing,
+            derivatives=derivatives, extrapolate="clamp", validate=False,
+        )  # fmt: skip
 
     def _argument(self, slot: str, state: State, places: Places, part: slice) -> Array:
         """Numbers of an argument: one for all measurements, or one each."""
