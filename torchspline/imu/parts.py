@@ -9,6 +9,9 @@ from torch import Tensor, nn
 from torchspline import checks, units
 from torchspline.splines.trajectory import Trajectory
 
+#: A parameter of a sensor: a tensor, numbers, or one number for all its entries; None where there is none.
+Given = Tensor | Sequence[float] | float | None
+
 
 def keep(module: nn.Module, name: str, x: Tensor | None) -> None:
     """A `Parameter` or a tensor that carries a graph as given, any other as a copy that is not learnt."""
