@@ -28,6 +28,8 @@ _SLOWED = 0.4
 _WELL_BEFORE = 3
 #: Changes within this factor of the least count as alike.
 _ALIKE = 1.7
+#: Weight of the straight line across a gap when smoothing: holds the curve there, and is not felt beside poses.
+_BRIDGE = 1e-8
 
 
 class Knots:
@@ -90,6 +92,52 @@ class Knots:
         """
         return self._linear_fit(*self.place(times), values, smoothness)
 
+    def smooth_fit(self, times: Tensor, values: FloatArray, spacing: float, step: float) -> FloatArray:
+        """Control points (M, C) of the smoothing spline in R^C that passes what splines of wider knots would pass.
+
+        Minimises the squared misses and the weighted integral of the squared derivative of the highest degree m that
+        the spline has, m = order - 1 [Schoenberg 1964, Reinsch 1967]. To uniform samples that is a filter of gain
+        `1 / (1 + (omega / omega_half)^(2 m))`. Least squares on knots `spacing` apart halve the same frequency,
+        `omega_half = pi / spacing`, but have another gain beside knots than between them.
+
+        Args:
+            spacing: above that of these knots, s. step: usual distance of the times, s.
+        """
+        m = self.order - 1
+        first, u = self.place(times)
+        weights = self._basis(first, u, 0)
+        # The m-th derivative is constant between knots: differences of control points give its integral exactly.
+        rough = self.seconds / step * (spacing / (math.pi * self.seconds)) ** (2 * m)
+        band = rough * difference_band(self.count, m, self.order)
+        band += gram_band(weights, first, self.count)
+        right_side = transpose_apply(weights, first, self.count, values)
+        between, line = self._across_gaps(times, values)
+        if len(between):
+            first, u = self.place(between)
+            weights = self._basis(first, u, 0)
+            band += _BRIDGE * gram_band(weights, first, self.count)
+            right_side += _BRIDGE * transpose_apply(weights, first, self.count, line)
+        return solve_band(band, right_side)
+
+    def grid(self, each: int) -> Tensor:
+        """So many evenly spaced times in every knot interval, from the first knot on, in the unit of the times."""
+        steps = torch.arange(self.segments * each)
+        if self.nanoseconds:
+            return self.t0 + steps * self.dt // each
+        return self.t0 + steps.to(torch.float64) * (self.dt / each)
+
+    def among(self, grid: Tensor, times: Tensor) -> Tensor:
+        """Which times of a grid have measurements around them: not within `gaps`, nor beyond the last."""
+        after = torch.searchsorted(times, grid).clamp(1, len(times) - 1)
+        return (times[after] - times[after - 1] <= 2 * self.dt) & (grid <= times[-1])
+
+    def _across_gaps(self, times: Tensor, values: FloatArray) -> tuple[Tensor, FloatArray]:
+        """Times within gaps, and the straight lines across."""
+        grid = self.grid(1)
+        grid = grid[~self.among(grid, times) & (grid <= times[-1])]
+        since, knots = ((x - self.t0).to(torch.float64).numpy() for x in (grid, times))
+        return grid, np.stack([np.interp(since, knots, column) for column in values.T], axis=1)
+
     def linear_fit_at(self, s: Tensor, values: FloatArray) -> FloatArray:
         """The same without smoothing, times in knot spacings since the start."""
         return self._linear_fit(*self._place_at(s), values, 0.0)
@@ -126,6 +174,15 @@ class Spacing:
     rotation: float
     position: float
     reason: str
+    #: Usual distance of the times, s, and whether they are so many that smoothing is better than wide knots.
+    step: float = 0.0
+    smooth: bool = False
+
+    @property
+    def knots(self) -> float:
+        """Spacing of knots for the fit: so narrow that smoothing decides, not they."""
+        narrower = min(self.rotation, self.position)
+        return max(narrower / 2, min(_LEAST_POSES * self.step, narrower)) if self.smooth else narrower
 
 
 def choose_spacing(
@@ -148,7 +205,8 @@ def choose_spacing(
     steps = steps[steps > 0] * unit
     # Poses may come in bursts, and with gaps between them.
     usual = steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)]
-    span, narrow = float(steps.sum()), _LEAST_POSES * max(float(steps.median()), float(usual.mean()))
+    span, step = float(steps.sum()), max(float(steps.median()), float(usual.mean()))
+    narrow = _LEAST_POSES * step
     widest = max(span / _LEAST_INTERVALS, narrow)
     tried: list[float] = []
     misses: list[tuple[float, float]] = []
@@ -190,7 +248,7 @@ def choose_spacing(
         f"judged by how fits at near spacings differ, {rotation * 1e3:.3g} ms suit angular velocity (difference "
         f"{turns:.3g} rad/s) and {position * 1e3:.3g} ms acceleration ({pulls:.3g} m/s^2)"
     )
-    return Spacing(rotation, position, reason)
+    return Spacing(rotation, position, reason, step, smooth=len(steps) > 2 * order)
 
 
 def _per_axis(x: FloatArray) -> float:
@@ -199,20 +257,13 @@ def _per_axis(x: FloatArray) -> float:
 
 
 def _well_inside(times: Tensor, unit: float, narrow: float) -> Tensor:
+    """Which times are so far from the ends and from gaps that the narrowest knots are held there."""
     seconds = (times - times[0]).to(torch.float64) * unit
-    margin = 4 * narrow
-    edges = torch.cat(
-        [
-            seconds[:1],
-            seconds[1:][seconds.diff() > 4 * narrow],
-            seconds[:-1][seconds.diff() > 4 * narrow],
-            seconds[-1:],
-        ]
-    )
-    edges = edges.sort().values
+    gap = seconds.diff() > 2 * narrow
+    edges = torch.cat([seconds[:1], seconds[1:][gap], seconds[:-1][gap], seconds[-1:]]).sort().values
     after = torch.searchsorted(edges, seconds).clamp(1, len(edges) - 1)
     distance = torch.minimum((seconds - edges[after - 1]).abs(), (edges[after] - seconds).abs())
-    inside = distance >= margin
+    inside = distance >= 10 * narrow
     return inside if bool(inside.any()) else torch.ones_like(inside)
 
 

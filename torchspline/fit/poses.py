@@ -4,12 +4,13 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchspline import checks
 from torchspline.fit.bends import Bends
-from torchspline.fit.knots import Knots, choose_spacing
+from torchspline.fit.knots import Knots, Spacing, choose_spacing
 from torchspline.fit.problem import Problem
 from torchspline.fit.progress import progress_bar
 from torchspline.fit.residuals.pose import Pose
@@ -138,10 +139,9 @@ def fit_poses(
     if isinstance(dt, str):
         signed = consistent_signs(measured, group)
         spacing = choose_spacing(times, signed, order, smoothness, accuracy)
-        dt = min(spacing.rotation, spacing.position)
+        dt = spacing.knots
     width = float(dt)
     knots = Knots(times, width, order)
-    per_interval = len(times) / knots.segments
     weight = torch.tensor([1 / position_sigma] * 3 + [1 / rotation_sigma] * 3, dtype=torch.float64)
     with (
         torch.inference_mode(False),
@@ -149,12 +149,17 @@ def fit_poses(
         progress_bar(progress, max_iterations, "fitting poses") as show,
     ):
         times, measured = times.clone(), consistent_signs(measured.clone(), group)
-        control_points = _start(knots, times, measured, group, smoothness * per_interval)
+        if spacing is not None and spacing.smooth:
+            at, followed = _smoothed(knots, times, measured, spacing)
+        else:
+            at, followed = times, measured
+        per_interval = len(at) / knots.segments
+        control_points = _start(knots, at, followed, group, smoothness * per_interval)
         trajectory = BSpline(control_points, group=group, order=order, **knots.options())
         if group != SE3:
             trajectory = SplitBSpline(control_points, order=order, **knots.options())
         problem = Problem(trajectory)
-        problem.add(Pose(times, measured, sigma=1.0 / weight))
+        problem.add(Pose(at, followed, sigma=1.0 / weight))
         linearizer = problem.prepare()
         linearizer.terms.append(
             Bends(linearizer.model, weight.numpy() * math.sqrt(smoothness * per_interval))
@@ -162,10 +167,8 @@ def fit_poses(
         options = Options(max_iterations, tolerance, 0.0, damping=1e-6)
         state, _, trace = minimise(linearizer.model, linearizer.model.state(), linearizer, options, show)
         linearizer.model.store(state)
-        if spacing is not None and representation == "split":
-            wide = spacing.position
-            if accuracy is not None:  # which must not be lost: a whole multiple is met exactly
-                wide = width * int(wide / width + 1e-6)
+        if accuracy is not None and spacing is not None and representation == "split":
+            wide = width * int(spacing.position / width + 1e-6)  # a whole multiple is met exactly
             trajectory.control_points[:, :3] = _smoother(knots, times, measured[:, :3], wide, smoothness)
     fitted = trajectory(times).detach()
     residual = torch.full((2, t.shape[0], 3), torch.nan, dtype=torch.float64)
@@ -211,6 +214,18 @@ def _start(knots: Knots, times: Tensor, measured: Tensor, group: Group, smoothne
     vanished = solution[:, 3:].norm(dim=-1) < 1e-3
     solution[vanished, 3:] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
     return group.normalize(solution)
+
+
+def _smoothed(knots: Knots, times: Tensor, measured: Tensor, spacing: Spacing) -> tuple[Tensor, Tensor]:
+    """Poses on a smooth curve through those measured, at times that are dense among the knots; none within gaps."""
+    grid = knots.grid(3)
+    grid = grid[knots.among(grid, times)]
+    parts = []
+    for columns, wide in ((slice(0, 3), spacing.position), (slice(3, 7), spacing.rotation)):
+        own = Knots(times, max(wide / 2, knots.seconds), knots.order)
+        numbers = measured[:, columns].numpy()
+        parts.append(own.evaluate(own.smooth_fit(times, numbers, wide, spacing.step), grid))
+    return grid, SE3.normalize(torch.from_numpy(np.concatenate(parts, axis=1)))
 
 
 def _smoother(knots: Knots, times: Tensor, positions: Tensor, spacing: float, smoothness: float) -> Tensor:
