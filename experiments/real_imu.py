@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from recordings.load import YARDSTICK, Recording, load, longest_stretch, near_gaps
 
 from torchspline import BSpline, fit_poses
-from torchspline.fit.align import Alignment, align_imu
+from torchspline.fit import Alignment, align_imu
 from torchspline.imu import measure
 from torchspline.units import SECOND
 

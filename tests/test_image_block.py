@@ -189,7 +189,7 @@ def gyroscopes(group: str = "R3xSO3", count: int = 60) -> Problem:
 def test_redundancies_are_traces(sparse, monkeypatch):
     """Each that of a dense matrix; together what is left when unknowns are taken off."""
     if sparse:  # whatever is wider than nothing goes there
-        monkeypatch.setattr("torchspline.fit.linearizer._WIDEST_BAND", 0)
+        monkeypatch.setattr("torchspline.fit.solving.linearizer._WIDEST_BAND", 0)
     problem = gyroscopes()
     result = problem.solve(max_iterations=3)
     linearizer, state = result._linearizer, result._state

@@ -10,16 +10,16 @@ import torch
 from numpy.testing import assert_allclose
 
 import torchspline as ts
-from torchspline.fit.bends import Bends
-from torchspline.fit.marginal import marginalised, random_walk
 from torchspline.fit.online import SlidingWindow
+from torchspline.fit.online.marginal import marginalised, random_walk
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Clock
 from torchspline.fit.residuals import Accelerometer, Gyroscope, Pose, StateValue, StateVelocity
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import BandSystem
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.bends import Bends
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.system import BandSystem
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, product
 

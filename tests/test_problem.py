@@ -32,7 +32,7 @@ from torchspline.fit import (
     smoothness,
     terms,
 )  # fmt: skip
-from torchspline.fit.system import BandSystem
+from torchspline.fit.solving.system import BandSystem
 
 # ---------------------------------------------------------------------- each residual
 

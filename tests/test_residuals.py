@@ -19,8 +19,8 @@ from fit_cases import (
 
 from torchspline import R3, SE3, SO3, Group, product
 from torchspline.fit import RelativePose
-from torchspline.fit.kernel import ResidualKernel, kernel_of
 from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.solving.kernel import ResidualKernel, kernel_of
 
 each_kind = pytest.mark.parametrize("kind", RESIDUALS.values(), ids=RESIDUALS)
 

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from torchspline.arithmetic.recurrence import forward
 from torchspline.calibrate.problem import Layout
-from torchspline.fit.kernel import ResidualKernel
-from torchspline.fit.linearizer import Linearizer
-from torchspline.fit.model import State
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import Rows, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.kernel import ResidualKernel
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import State
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.system import Rows, System
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import SO3, Group
 from torchspline.groups.components import join, split

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import Rows, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import Rows, System
+from torchspline.fit.solving.terms import Term
 from torchspline.groups import Group
 from torchspline.splines.basis import cumulative_weights
 

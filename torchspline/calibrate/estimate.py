@@ -23,7 +23,7 @@ from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
 from torchspline.fit.losses import Huber, Loss
 from torchspline.fit.residual import Residual
 from torchspline.fit.result import OpenDirection, Result, control_point_deviation
-from torchspline.fit.solver import Options as Solver
+from torchspline.fit.solving.solver import Options as Solver
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
 from torchspline.splines.bspline import BSpline

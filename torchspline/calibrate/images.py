@@ -23,10 +23,10 @@ from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.so3 import rotate
 from torchspline.arithmetic.vector import Vector, cross, negate
 from torchspline.fit.losses import Loss
-from torchspline.fit.model import Model, State
 from torchspline.fit.residual import POSE_IN_BODY, Argument, Clock, Moment, Residual, Slot
 from torchspline.fit.residuals.reprojection import ReprojectionEquidistant, ReprojectionRadtan
-from torchspline.fit.terms import Differential, Kernel, Places, Term
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.terms import Differential, Kernel, Places, Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
 from torchspline.groups.components import join, split

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.calibrate.images import PROJECTIONS
 from torchspline.calibrate.recording import Corners, Recording
-from torchspline.fit.kernel import kernel_of
+from torchspline.fit.solving.kernel import kernel_of
 from torchspline.groups import SE3, Group
 from torchspline.imu import ImuNoise, measure
 from torchspline.io.camera import Camera

@@ -1,7 +1,7 @@
 """Trajectories and sensor parameters from measurements."""
 
 from torchspline.fit import residuals
-from torchspline.fit.align import Alignment, align_imu
+from torchspline.fit.alignment import Alignment, align_imu
 from torchspline.fit.approximation import Approximation, Difference, approximate, compare
 from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
 from torchspline.fit.online import SlidingWindow

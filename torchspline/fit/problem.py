@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.implicit import differentiable as of_solution
-from torchspline.fit.linearizer import Linearizer
-from torchspline.fit.model import Model, Spline, Unknown
-from torchspline.fit.priors import Part, Prior
-from torchspline.fit.progress import progress_bar
 from torchspline.fit.residual import Residual, square_root_information, weighting_of
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.implicit import differentiable as of_solution
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import Model, Spline, Unknown
+from torchspline.fit.solving.priors import Part, Prior
+from torchspline.fit.solving.progress import progress_bar
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 

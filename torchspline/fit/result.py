@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.linearizer import Linearizer
-from torchspline.fit.model import State, Unknown
-from torchspline.fit.scatter import scatter
-from torchspline.fit.solver import Trace
-from torchspline.fit.system import BandSystem, Factor, SingularError, System
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import State, Unknown
+from torchspline.fit.solving.scatter import scatter
+from torchspline.fit.solving.solver import Trace
+from torchspline.fit.solving.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.model import Model, Spline, State, with_points
-from torchspline.fit.priors import Prior, steps_of
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Residual
-from torchspline.fit.solver import LEAST_DIAGONAL, MOST_DAMPING, Options
-from torchspline.fit.system import Rows
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.model import Model, Spline, State, with_points
+from torchspline.fit.solving.priors import Prior, steps_of
+from torchspline.fit.solving.solver import LEAST_DIAGONAL, MOST_DAMPING, Options
+from torchspline.fit.solving.system import Rows
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.kernels.assemble import add_to_band
 from torchspline.splines.bspline import BSpline

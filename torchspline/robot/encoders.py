@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.banded import difference_band, gram_band, solve_band, transpose_apply
-from torchspline.fit.knots import Knots
+from torchspline.fit.poses.banded import difference_band, gram_band, solve_band, transpose_apply
+from torchspline.fit.poses.knots import Knots
 from torchspline.groups.group import Rn
 from torchspline.splines.basis import blending_matrix, derivative_matrix
 from torchspline.splines.bspline import BSpline

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchspline.fit.approximation.compare import union, within
 from torchspline.fit.approximation.source import Source
-from torchspline.fit.banded import gram_band, transpose_apply
+from torchspline.fit.poses.banded import gram_band, transpose_apply
 from torchspline.groups.components import split
 from torchspline.splines.keyframes import consistent_signs
 from torchspline.splines.nonuniform import basis, local_knots, nonuniform_bspline

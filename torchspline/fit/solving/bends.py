@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import Rows, System
-from torchspline.fit.terms import CHUNK
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import Rows, System
+from torchspline.fit.solving.terms import CHUNK
 
 Array = NDArray[Any]
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.linearizer import CostTerm
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import BandSystem
+from torchspline.fit.solving.linearizer import CostTerm
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import BandSystem
 
 Array = NDArray[Any]
 

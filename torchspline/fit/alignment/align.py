@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit import align_start
-from torchspline.fit.align_joint import FEWEST, Joint, Readings, Solution
+from torchspline.fit.alignment import start as align_start
+from torchspline.fit.alignment.joint import FEWEST, Joint, Readings, Solution
 from torchspline.fit.losses import GemanMcClure, Loss
-from torchspline.fit.model import with_points
 from torchspline.fit.residual import needs
+from torchspline.fit.solving.model import with_points
 from torchspline.groups.group import SO3
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 from torchspline.splines.bspline import BSpline

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.bends import Bends
-from torchspline.fit.knots import Knots, Spacing, choose_spacing
+from torchspline.fit.poses.knots import Knots, Spacing, choose_spacing
 from torchspline.fit.problem import Problem
-from torchspline.fit.progress import progress_bar
 from torchspline.fit.residuals.pose import Pose
-from torchspline.fit.solver import Options, minimise
+from torchspline.fit.solving.bends import Bends
+from torchspline.fit.solving.progress import progress_bar
+from torchspline.fit.solving.solver import Options, minimise
 from torchspline.groups.group import R3, SE3, SO3, Group, product
 from torchspline.splines.bspline import BSpline, SplitBSpline
 from torchspline.splines.keyframes import consistent_signs

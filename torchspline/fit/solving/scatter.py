@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.linearizer import Linearizer
-from torchspline.fit.model import State
-from torchspline.fit.system import BandFactor, Factor
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import State
+from torchspline.fit.solving.system import BandFactor, Factor
+from torchspline.fit.solving.terms import Term
 
 Array = NDArray[Any]
 #: Fewest stretches whose scatter says anything.

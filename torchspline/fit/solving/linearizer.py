@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import BandSystem, SparseSystem, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import BandSystem, SparseSystem, System
+from torchspline.fit.solving.terms import Term
 
 Array = NDArray[Any]
 #: Beyond these the equations are no band with a narrow border any more, and go to a sparse factorisation.

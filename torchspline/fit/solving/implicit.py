@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchspline.fit.kernel import ResidualKernel
-from torchspline.fit.linearizer import Linearizer
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.solving.kernel import ResidualKernel
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import Factor, SingularError, System
 from torchspline.fit.variables import Variable
 from torchspline.groups.components import join, split
 

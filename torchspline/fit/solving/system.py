@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.model import Model, State
+from torchspline.fit.solving.model import Model, State
 from torchspline.kernels.assemble import add_to_band, add_to_blocks
 from torchspline.kernels.band import inverse_band
 

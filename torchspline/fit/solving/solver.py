@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchspline import checks
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import Factor, SingularError, System
 from torchspline.kernels.mode import RefusedError
 
 Array = NDArray[Any]

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchspline.fit.kernel import ResidualKernel, kernel_of
-from torchspline.fit.model import Model, Spline, State, seconds
 from torchspline.fit.residual import Residual, square_root_information
-from torchspline.fit.system import Rows, System
+from torchspline.fit.solving.kernel import ResidualKernel, kernel_of
+from torchspline.fit.solving.model import Model, Spline, State, seconds
+from torchspline.fit.solving.system import Rows, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline, bspline
 from torchspline.splines.trajectory import State as SplineState

@@ -8,12 +8,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchspline.fit import align_start
+from torchspline.fit.alignment import start as align_start
 from torchspline.fit.losses import Loss
 from torchspline.fit.problem import Linearizer, Problem
 from torchspline.fit.residual import Clock, Residual
 from torchspline.fit.residuals import RESIDUALS
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.group import SO3
 from torchspline.splines.bspline import BSpline

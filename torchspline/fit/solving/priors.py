@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import System
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 from torchspline.splines.local import LocalSpline

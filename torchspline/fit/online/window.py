@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.bends import Bends
-from torchspline.fit.marginal import marginalised, normal_equations, random_walk
-from torchspline.fit.model import Model, Spline
-from torchspline.fit.priors import Part, Prior
+from torchspline.fit.online.marginal import marginalised, normal_equations, random_walk
+from torchspline.fit.online.streams import Stream, trajectory_times, variables_of
 from torchspline.fit.problem import Problem, include_unknowns
 from torchspline.fit.residual import Residual
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.streams import Stream, trajectory_times, variables_of
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.bends import Bends
+from torchspline.fit.solving.model import Model, Spline
+from torchspline.fit.solving.priors import Part, Prior
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
 from torchspline.splines.bspline import BSpline

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from torchspline.fit.solver import Trace
+from torchspline.fit.solving.solver import Trace
 
 
 @contextmanager

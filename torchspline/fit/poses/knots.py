@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchspline.fit.banded import FloatArray, difference_band, gram_band, solve_band, transpose_apply
+from torchspline.fit.poses.banded import FloatArray, difference_band, gram_band, solve_band, transpose_apply
 from torchspline.splines.basis import blending_matrix, derivative_matrix
 from torchspline.splines.clock import locate
 from torchspline.units import NANOSECOND, SECOND, unit_of
