@@ -4,12 +4,10 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import error_online  # noqa: F401  (its cases are made of all that is accepted before this module adds to it)
 import numpy as np
 import torch
 import yaml
 from error_arguments import (
-    ACCEPTED,
     F32,
     F64,
     FOLDER,
@@ -19,6 +17,7 @@ from error_arguments import (
     POSE,
     SAMPLES,
     Case,
+    accept,
     changed,
     file,
     numbers,
@@ -86,7 +85,7 @@ def write(folder: object, calibration: object) -> None:
     calibrate.write_calibration(folder, found() if calibration is FOUND else calibration)
 
 
-ACCEPTED.update(
+accept(
     {
         "Camera": (
             Camera,
@@ -299,8 +298,6 @@ def _of_recordings() -> Iterator[Case]:
     for bad in (NAN, INF, 0.0, -1.0):
         yield refused("find_start", "max_offset", "nan", bad, f"got {bad}", "above zero")
 
-
-CASES = list(cases())
 
 _FILES = "read_camchain write_camchain read_corners read_recording write_calibration"
 _CHECKED = "Recording board_poses find_start"

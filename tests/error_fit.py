@@ -1,4 +1,4 @@
-"""What least squares is tried with, and what its errors have to say; joins the tables of the other functions."""
+"""Bad arguments of least squares: residuals, losses, unknowns, problems and their results."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from error_arguments import (
-    ACCEPTED,
     F64,
     I64,
     INF,
@@ -16,6 +15,7 @@ from error_arguments import (
     Q,
     T,
     V,
+    accept,
     changed,
     groups,
     numbers,
@@ -27,6 +27,7 @@ from error_arguments import (
 from fit_cases import sample
 
 from torchspline import R3, SE3, SO3, BSpline, Rn, fit
+from torchspline.fit.losses import Loss
 from torchspline.fit.residuals import RESIDUALS
 
 SPLINE = BSpline(POSE[0], group=SE3, dt=0.1)
@@ -100,7 +101,7 @@ def solve(**k: Any) -> Any:
     return problem.solve(**k)
 
 
-FITTING: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{name: (bound(name), arguments(name)) for name in RESIDUALS},
     **{name: (getattr(fit, name), {"scale": 2.0}) for name in ("Huber", "Cauchy", "GemanMcClure")},
     "Variable": (fit.Variable, {"name": "pose", "value": POSE[0, 0], "group": SE3, "sphere": False}),
@@ -119,7 +120,61 @@ FITTING: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Problem.release": (with_point("release"), {"unknown": SPLINE}),
     "Problem.solve": (solve, {"max_iterations": 1}),
 }
-ACCEPTED |= FITTING
+accept(FUNCTIONS)
+
+_LOSSES = " ".join(loss.__name__ for loss in Loss.__subclasses__())
+_SOLVING = "Problem.add_prior Problem.freeze Problem.release Problem.solve Result.covariance Result.standard_deviation"
+_NUMBERS = f"{_LOSSES} Problem.release Problem.solve Result.covariance Result.standard_deviation"
+_WITHOUT_QUATERNIONS = " ".join(
+    name
+    for name, kind in RESIDUALS.items()
+    if name != "StateValue"
+    and not kind.measured_signs
+    and all(slot.group is None for slot in kind.slots.values())
+)
+
+#: What is made and handed out.
+RESULTS = {"Result"}
+UNTRIED = {
+    "Problem.prepare": "no arguments",
+    "Residual.bind": "tried through Problem.add, which calls it",
+    **{
+        getattr(kind, method).__qualname__: "called by the solver, on numbers that were checked"
+        for kinds, methods in (
+            (RESIDUALS.values(), ("evaluate", "reverse")),
+            (Loss.__subclasses__(), ("rho", "weight")),
+            ((fit.Variable,), ("basis", "points", "retract")),
+        )
+        for kind in kinds
+        for method in methods
+    },
+}
+#: Where a kind of mistake cannot be made, as in test_errors.py.
+NOT_APPLICABLE: dict[str, dict[str, str]] = {
+    "shape": {"no tensor": _NUMBERS},
+    "dtype": {"no tensor": f"Problem {_NUMBERS}"},
+    "device": {
+        "measurements are copied to the CPU": f"{' '.join(RESIDUALS)} Variable Clock smoothness Problem.add",
+        "no tensor that stays": f"{_LOSSES} {_SOLVING}",
+    },
+    "nan": {
+        "checked when the residual was made": "Problem.add",
+        "no numbers that can be one": "Problem.freeze Problem.release Result.covariance Result.standard_deviation",
+    },
+    "zero quaternion": {
+        "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
+        "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
+        "Result.trajectory_covariance",
+    },
+    "count": {
+        "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
+        f"Problem.add Result.trajectory_covariance {_SOLVING}",
+    },
+    "time": {
+        "no trajectory to lie on before Problem.add": f"{' '.join(RESIDUALS)} {_LOSSES} Variable Clock",
+        "times come with residuals": f"smoothness Problem {_SOLVING}",
+    },
+}
 
 
 def cases() -> Iterator[Case]:

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 from error_arguments import (
-    ACCEPTED,
     FOLDER,
     NAN,
     POSE_COLUMNS,
@@ -16,6 +15,7 @@ from error_arguments import (
     SPLINE,
     Case,
     Q,
+    accept,
     changed,
     file,
     numbers,
@@ -37,7 +37,7 @@ def write_rosbag(path: Any, records: Any) -> None:
         torchspline.io.write_rosbag(path, records)
 
 
-ACCEPTED.update(
+accept(
     {
         "save_trajectory": (
             records.save_trajectory,
@@ -147,6 +147,3 @@ def of_ros() -> Iterator[Case]:
         yield refused(function, "topic", "option", "/a", "got '/a'", "is no ROS bag")
         bag = file("", "x.bag")
         yield refused(function, "topic", "type", 5, "got int", "the name of a topic", path=bag)
-
-
-CASES = list(cases())

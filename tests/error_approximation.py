@@ -1,20 +1,18 @@
-"""Bad arguments of splines whose knots are in nanoseconds, and of going from one family to another."""
+"""Bad arguments of going from one family of splines to another."""
 
 from collections.abc import Iterator
 
 import torch
 from error_arguments import (
-    ACCEPTED,
     F64,
     I64,
     INF,
     NAN,
-    NS,
     POSE,
     SPLINE,
     Case,
-    T,
     V,
+    accept,
     numbers,
     refused,
     wholes,
@@ -26,7 +24,7 @@ from torchspline.fit import approximate, compare
 #: What is made and handed out.
 RESULTS = {"Approximation", "Difference"}
 
-ACCEPTED.update(
+accept(
     {
         "approximate": (approximate, {"trajectory": SPLINE, "family": NonuniformBSpline}),
         "compare": (compare, {"trajectory": SPLINE, "reference": SPLINE}),
@@ -45,21 +43,7 @@ def nanoseconds(seconds: torch.Tensor) -> torch.Tensor:
     return (seconds * 1e9).round().to(I64)
 
 
-def clocks() -> Iterator[Case]:
-    for function, knots in (("hermite", "times"), ("nonuniform_bspline", "knots"), ("interpolate", "times")):
-        whole = nanoseconds(ACCEPTED[function][1][knots])
-        for bad in (T, T.float(), NS.int()):
-            yield refused(
-                function, "t", "dtype", bad, f"got {bad.dtype}", "int64 nanoseconds", **{knots: whole}
-            )
-        for bad, came in ((NS - 1, "is -1;"), (NS + 499_999_999, "is 500000001;")):
-            outside = "outside the domain [0, 500000000] ns"
-            yield refused(function, "t", "time", bad, came, outside, **{knots: whole})
-        for bad in (whole.flip(0), 0 * whole):
-            yield refused(function, knots, "option", bad, "got ", "expected ", t=NS)
-
-
-def families() -> Iterator[Case]:
+def cases() -> Iterator[Case]:
     function = "approximate"
     for bad in (POSE, None, 5):
         yield refused(
@@ -126,6 +110,3 @@ def families() -> Iterator[Case]:
     three = SplitBSpline(POSE[:1].expand(3, 8, 7), dt=0.1)
     yield refused(function, "reference", "batch", three, "reference (3,)", "trajectory (2,)")
     yield from wholes(function, "samples", 1)
-
-
-CASES = [*clocks(), *families()]
