@@ -29,6 +29,7 @@ from fit_cases import sample
 from torchspline import R3, SE3, SO3, BSpline, Rn, fit
 from torchspline.fit.losses import Loss
 from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.residuals.motion import MotionResidual
 
 SPLINE = BSpline(POSE[0], group=SE3, dt=0.1)
 TURNING = BSpline(Q[0], group=SO3, dt=0.1)
@@ -142,6 +143,7 @@ UNTRIED = {
         getattr(kind, method).__qualname__: "called by the solver, on numbers that were checked"
         for kinds, methods in (
             (RESIDUALS.values(), ("evaluate", "reverse")),
+            (MotionResidual.__subclasses__(), ("error", "error_reverse")),
             (Loss.__subclasses__(), ("rho", "weight")),
             ((fit.Variable,), ("basis", "points", "retract")),
         )

@@ -54,7 +54,7 @@ _TOGETHER = (
 
 @dataclass
 class _ImageKernel:
-    """See `fit.terms.Kernel`."""
+    """See `fit.solving.terms.Kernel`."""
 
     order: list[str]
     rows: int
