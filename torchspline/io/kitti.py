@@ -100,10 +100,18 @@ def write_poses(path: Path, record: PoseRecord, times: Path | None = None) -> No
     stamps = times or times_beside(path)
     if stamps.resolve() == path.resolve():
         raise ValueError(f"times: expected another file than that of the poses, got {stamps}")
-    matrices = torch.cat([SO3.to_matrix(record.rotation), record.position[..., None]], -1).reshape(-1, 12)
+    matrices = torch.cat([_matrices(record.rotation), record.position[..., None]], -1).reshape(-1, 12)
     check_folder(stamps)
     write_table(path, "", (), matrices.detach().cpu().numpy(), " ")
     write_bytes(stamps, "".join(f"{format_seconds(t)}\n" for t in record.time_ns.tolist()).encode())
+
+
+def _matrices(rotation: torch.Tensor) -> torch.Tensor:
+    """NaN where quaternions are not finite."""
+    finite = rotation.isfinite().all(-1)
+    found = rotation.new_full((len(rotation), 3, 3), float("nan"))
+    found[finite] = SO3.to_matrix(rotation[finite])
+    return found
 
 
 def _quaternions(table: Table, rotations: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -91,7 +91,9 @@ def _series(
         motion = record.kinematics(t)
     found = {key: x for key, x in motion._asdict().items() if x is not None and "acceleration" not in key}
     if "position" not in found or found["position"].ndim != 2:
-        raise ValueError(f"records[{name!r}]: expected one trajectory with positions, got {record.group}")
+        batch = found.get("position", stamps).ndim > 2
+        got = "a batch of them" if batch else f"one of {record.group}"
+        raise ValueError(f"records[{name!r}]: expected one trajectory with positions, got {got}")
     return stamps, found
 
 
