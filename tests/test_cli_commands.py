@@ -56,7 +56,7 @@ BAD = {
     "bench": (("--queries", "0"), "queries: expected a whole number of at least 1, got 0"),
     "view": (("{saved}", "--up", "w"), "up"),
     "explore": (("--methods", "SLERPY", "--figure", "x.png"), "methods: expected one of"),
-    "convert": (("{poses}", "{out}/p.xyz"), "to: expected tum, euroc, nerfstudio or ros"),
+    "convert": (("{poses}", "{out}/p.xyz"), "to: expected tum, euroc, kitti, nerfstudio, ros or rerun"),
     "info": (("{broken}",), "broken.txt, line 2: expected a number in column 3"),
     "kernels show": (("SO9",), "no group is called 'SO9'"),
 }

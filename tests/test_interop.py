@@ -349,7 +349,7 @@ def test_rosbag_round_trip(tmp_path):
         read_poses(tmp_path / "bag")
     with pytest.raises(ValueError, match=r"bag: expected the topic '/pose' with IMU samples .*, got /imu"):
         read_imu(tmp_path / "bag", topic="/pose")
-    with pytest.raises(FileExistsError, match="expected a folder that does not exist yet"):
+    with pytest.raises(FileExistsError, match="expected a name that nothing has yet"):
         write_rosbag(tmp_path / "bag", {"/imu": imu})
 
 

@@ -1,5 +1,6 @@
 """The command line. `COMMANDS` lists the commands; a new one is a module beside this one and a line in it."""
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -80,12 +81,13 @@ def run(words: Sequence[str]) -> int:
         return 0 if found.passed else 1
     except Mistake as mistake:
         return _refuse(f"{mistake} (torchspline {name} --help says more)")
+    except BrokenPipeError:  # whoever read has enough; what is left goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except _EXPECTED as error:
         return _refuse(str(error) or type(error).__name__)
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        return 0
 
 
 def _refuse(message: str) -> int:

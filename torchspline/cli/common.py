@@ -1,23 +1,26 @@
 """What several commands do."""
 
+import json
 import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchspline.fit import PoseFit
 from torchspline.imu import ImuReading
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
+from torchspline.io.archive import replacing, write_bytes
 from torchspline.splines import Trajectory
 from torchspline.units import SECOND
 
 
 def longest_stretch(record: PoseRecord, gap: float | None, start: float, duration: float) -> PoseRecord:
     """The longest run of usable poses without a larger gap, cut to `start` and `duration`."""
-    usable = ~(record.position.isnan().any(-1) | record.rotation.isnan().any(-1))
+    usable = record.position.isfinite().all(-1) & record.rotation.isfinite().all(-1)
     rows = torch.argsort(record.time_ns, stable=True)
     rows = rows[usable[rows]]
     record = PoseRecord(record.time_ns[rows], record.position[rows], record.rotation[rows], record.source)
@@ -83,6 +86,17 @@ def fit_report(fit: PoseFit, dt: float) -> dict[str, Any]:
         "stopped": fit.reason,
         "notes": fit.notes,
     }
+
+
+def save_figure(path: Path, figure: Figure, dpi: int = 130) -> None:
+    """Draw a figure into a file (png, pdf, svg), whole or not at all."""
+    with replacing(path) as part:
+        figure.savefig(part, dpi=dpi, format=path.suffix[1:] or "png")
+
+
+def write_report(path: Path, values: dict[str, Any]) -> None:
+    """What scripts read, as JSON."""
+    write_bytes(path, (json.dumps(values, indent=2) + "\n").encode())
 
 
 def write_results(out: Path, trajectory: Trajectory, stamps: Tensor, made: ImuReading) -> None:

@@ -1,12 +1,20 @@
 """`torchspline demo`."""
 
-import json
 import math
 from pathlib import Path
 
 import torch
 
-from torchspline.cli.common import excerpt, fit_report, fit_rows, rmse, write_results
+from torchspline.cli.common import (
+    SECOND,
+    excerpt,
+    fit_report,
+    fit_rows,
+    rmse,
+    save_figure,
+    write_report,
+    write_results,
+)
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.groups import SO3
@@ -14,7 +22,6 @@ from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline
-from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline demo
@@ -63,7 +70,7 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         "IMU synthesised from noisy poses, and the truth",
         ("synthesised", "truth"),
     )
-    figure.savefig(out / "imu.png", dpi=130)
+    save_figure(out / "imu.png", figure)
 
     rows = [
         ("poses at 120 Hz", str(len(stamps)), ""),
@@ -79,7 +86,7 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         "seed": seed,
         "fit": fit_report(fit, spacing),
     }
-    (out / "report.json").write_text(json.dumps({"passed": passed, **values}, indent=2) + "\n")
+    write_report(out / "report.json", {"passed": passed, **values})
     names = ("poses.txt", "trajectory.txt", "imu.csv", "imu_truth.csv", "imu.png", "report.json")
     notes = [f"check against the truth: {'passed' if passed else 'FAILED'}"]
     return Report("torchspline demo", values, rows, notes, [out / name for name in names], passed)

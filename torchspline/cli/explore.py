@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
+from torchspline.cli.common import save_figure
 from torchspline.cli.report import Report
 from torchspline.explore import METHODS, Explorer
 
@@ -51,7 +52,7 @@ def explore(
         Explorer(methods=chosen) if file is None else Explorer.load(file, keyframes, chosen, format, times)
     )
     if figure is not None:
-        explorer.figure().savefig(figure, dpi=150)
+        save_figure(figure, explorer.figure(), dpi=150)
         _, wrong = explorer.curves()
         return Report(
             "figure", {"methods": chosen, "keyframes": len(explorer.keyframes)},

@@ -1,6 +1,5 @@
 """`torchspline imu`."""
 
-import json
 import math
 from pathlib import Path
 from typing import Literal
@@ -8,17 +7,29 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchspline.cli.common import excerpt, fit_report, fit_rows, longest_stretch, rmse, write_results
+from torchspline.cli.common import (
+    SECOND,
+    excerpt,
+    fit_report,
+    fit_rows,
+    longest_stretch,
+    rmse,
+    save_figure,
+    write_report,
+    write_results,
+)
+from torchspline.cli.files import PoseFormat, open_poses
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
-from torchspline.io import ImuRecord, read_imu, read_poses
+from torchspline.io import ImuRecord, read_imu
+from torchspline.io.archive import replacing
 from torchspline.plot import imu_comparison
-from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline imu poses.txt --rate 200 --out DIR
 torchspline imu mocap0 --recorded imu0 --spacing 80
+torchspline imu drive.bag --topic /odom --recorded drive.bag --recorded-topic /imu/data
 torchspline imu kitti_00.txt --times times.txt --gravity "[0, 9.80665, 0]"
 """
 
@@ -36,14 +47,19 @@ def imu(
     start: float = 0.0,
     duration: float = math.inf,
     margin: float = 0.3,
-    format: Literal["tum", "euroc", "kitti"] | None = None,
+    format: PoseFormat | None = None,
     times: Path | None = None,
+    topic: str | None = None,
+    child: str | None = None,
+    recorded_topic: str | None = None,
 ) -> Report:
     """IMU readings from a file of poses, compared with a recording if there is one.
 
     Args:
-        poses: TUM, EuRoC or KITTI file of poses of the IMU's frame, gzipped or not.
-        recorded: EuRoC IMU file on the same clock. Constant biases are estimated and removed before comparing.
+        poses: TUM, EuRoC, KITTI or nerfstudio file, gzipped or not, or ROS bag: poses of the IMU's frame; - is
+            standard input.
+        recorded: EuRoC IMU file or ROS bag on the same clock. Constant biases are estimated and removed before
+            comparing.
         rate: of the synthesised readings, Hz.
         out: folder for the results; made if it is not there.
         spacing: of the knots, ms; by default five median pose intervals. A wrong one costs accuracy.
@@ -57,13 +73,16 @@ def imu(
         margin: left out at both ends, where a spline knows least, s.
         format: of the poses; by default recognised from their content.
         times: file of times that goes with KITTI poses.
+        topic: of the poses in a ROS bag; needed where it has several.
+        child: frame of the transforms in that topic; needed where it has several.
+        recorded_topic: of the recording in a ROS bag; needed where it has several.
     """
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
     if not margin >= 0:
         raise ValueError(f"margin: expected seconds, zero or more, got {margin}")
-    record = read_poses(poses, format, times)
-    recording = None if recorded is None else read_imu(recorded)
+    record = open_poses(poses, format, times, topic, child)
+    recording = None if recorded is None else read_imu(recorded, topic=recorded_topic)
     record = longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
     interval = record.time_ns.unique().diff().to(torch.float64).median().item() / SECOND
@@ -130,8 +149,8 @@ def imu(
         dots = excerpt(within.time_ns, ImuReading(within.gyroscope, within.accelerometer), early, first)
         _write_comparison(out / "comparison.csv", within, biased)
     write_results(out, fit.trajectory, stamps, made)
-    imu_comparison(lines, dots, title).savefig(out / "imu.png", dpi=130)
-    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    save_figure(out / "imu.png", imu_comparison(lines, dots, title))
+    write_report(out / "report.json", report)
     names = ["trajectory.txt", "imu.csv", "imu.png", "report.json"]
     if recording is not None:
         names.append("comparison.csv")
@@ -152,7 +171,8 @@ def _write_comparison(path: Path, recorded: ImuRecord, made: ImuReading) -> None
     columns = torch.cat([recorded.gyroscope, recorded.accelerometer, made.gyroscope, made.accelerometer], -1)
     rows = np.column_stack([recorded.time_ns.numpy().astype(object), columns.numpy()])
     header = ",".join(["timestamp_ns", *names])
-    np.savetxt(path, rows, delimiter=",", fmt=["%d", *["%.9g"] * len(names)], header=header, comments="")
+    with replacing(path) as part:
+        np.savetxt(part, rows, delimiter=",", fmt=["%d", *["%.9g"] * len(names)], header=header, comments="")
 
 
 def _three(x: Tensor) -> str:

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchspline.cli.files import is_trajectory, open_poses
+from torchspline.cli.files import PoseFormat, is_trajectory, open_record
 from torchspline.cli.report import Report
-from torchspline.io import ImuRecord, PoseRecord, load_trajectory, read_imu
+from torchspline.io import ImuRecord, PoseRecord, load_trajectory
 from torchspline.splines import Trajectory
 from torchspline.units import SECOND
 
@@ -16,39 +16,35 @@ EXAMPLES = """
 torchspline info poses.txt
 torchspline info V1_02_medium/imu0/data.csv --json
 torchspline info motion.npz
+gunzip -c poses.txt.gz | torchspline info -
+torchspline info drive.bag --topic /imu/data
 """
 
 
 def info(
-    file: Path, format: str | None = None, times: Path | None = None, topic: str | None = None
+    file: Path,
+    format: PoseFormat | None = None,
+    times: Path | None = None,
+    topic: str | None = None,
+    child: str | None = None,
 ) -> Report:
     """What is in a file: kind, rows, rate, gaps, duration, range of the numbers and their units.
 
     Args:
-        file: poses (TUM, EuRoC, KITTI, nerfstudio), IMU readings (EuRoC), a ROS bag, or a saved trajectory.
-        format: tum, euroc, kitti, ros or nerfstudio; by default recognised from the content.
+        file: poses (TUM, EuRoC, KITTI, nerfstudio, the root of BVH), IMU readings (EuRoC), a ROS bag, or a saved
+            trajectory; - is standard input.
+        format: by default recognised from the content.
         times: file of times that goes with KITTI poses.
-        topic: of a ROS bag.
+        topic: of a ROS bag; needed where it has several.
+        child: frame of the transforms in that topic; needed where it has several.
     """
     if is_trajectory(file):
         values, rows = _of_trajectory(load_trajectory(file))
         return Report(str(file), {"kind": "trajectory", **values}, [("kind", "trajectory", ""), *rows])
-    record = _open(file, format, times, topic)
+    record = open_record(file, format, times, topic, child)
     kind = "poses" if isinstance(record, PoseRecord) else "IMU readings"
     values, rows, notes = _of_record(record)
     return Report(str(file), {"kind": kind, **values}, [("kind", kind, ""), *rows], notes)
-
-
-def _open(file: Path, format: Any, times: Path | None, topic: str | None) -> PoseRecord | ImuRecord:
-    """As poses, and if it is none, as IMU readings."""
-    try:
-        return open_poses(file, format, times, topic)
-    except ValueError as first:
-        try:
-            return read_imu(file, format, topic)
-        except ValueError as second:
-            same = str(first) == str(second)
-            raise first if same else ValueError(f"not poses: {first}; not IMU readings: {second}") from None
 
 
 def _of_record(

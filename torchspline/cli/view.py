@@ -34,13 +34,14 @@ def view(
     format: PoseFormat | None = None,
     times: Path | None = None,
     topic: str | None = None,
+    child: str | None = None,
 ) -> Report:
     """A page with an interactive 3D view of a file, which any browser shows, also without a network.
 
     Poses are shown as dots, with a spline through them that tells frames and velocities.
 
     Args:
-        file: poses (TUM, EuRoC, KITTI, nerfstudio), a ROS bag, or a saved trajectory.
+        file: poses (TUM, EuRoC, KITTI, nerfstudio, the root of BVH), a ROS bag, or a saved trajectory.
         out: the page; by default named after the file, in this folder.
         open: show it in the browser.
         spacing: of the knots of the spline through poses, ms; auto finds one from the data.
@@ -52,7 +53,8 @@ def view(
         duration: how much of it to show, s.
         format: of the poses; by default recognised from their content.
         times: file of times that goes with KITTI poses.
-        topic: of a ROS bag.
+        topic: of a ROS bag; needed where it has several with poses.
+        child: frame of the transforms in that topic; needed where it has several.
     """
     measured, notes = None, []
     trajectory: Trajectory
@@ -60,7 +62,7 @@ def view(
         trajectory = load_trajectory(file)
     else:
         used, fit = fitted(
-            open_poses(file, format, times, topic), spacing, order, "split", gap, start, duration
+            open_poses(file, format, times, topic, child), spacing, order, "split", gap, start, duration
         )
         trajectory, measured, notes = fit.trajectory, used.position, fit.notes
     target = out or named_after(file, ".html")

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.groups.convert import from_transform_matrix, to_transform_matrix
 from torchspline.groups.group import SO3
-from torchspline.io.archive import check_folder, read_bytes
+from torchspline.io.archive import check_folder, read_bytes, write_bytes
 from torchspline.io.records import PoseRecord
 from torchspline.units import SECOND
 
@@ -141,7 +141,7 @@ def write_nerfstudio(
                 for i, (matrix, time) in enumerate(zip(matrices, record.time.tolist(), strict=True))
             ],
         }
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def _load(path: Path) -> dict[str, Any]:

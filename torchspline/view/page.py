@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.io.archive import check_folder, write_bytes
 from torchspline.plot.figure import named, times_of
 from torchspline.splines import Trajectory
 from torchspline.units import SECOND
@@ -74,10 +75,8 @@ def write_page(
     """
     if not isinstance(path, (str, PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
-    path.write_text(page(trajectories, **options), encoding="utf-8")
+    check_folder(Path(path))
+    write_bytes(Path(path), page(trajectories, **options).encode())
 
 
 def _curve(name: str, trajectory: Trajectory, samples: int) -> dict[str, Any]:
