@@ -124,6 +124,8 @@ def write_rosbag(
     first = path.suffix == ".bag"
     typesys = _library("typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
+    if _TREES[0] not in store.types:
+        store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TREES[0]))
     # Whoever is interrupted leaves no half of a bag.
     scratch = Path(tempfile.mkdtemp(prefix=".", dir=path.parent))
     try:

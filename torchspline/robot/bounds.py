@@ -36,8 +36,8 @@ def check_mjcf(text: bytes) -> None:
             raise ValueError(f"more than {_MOST_ELEMENTS} elements with all copies, at <{tag}>")
         if _product(attributes, _STORED.get(tag, ())) > _MOST_NUMBERS:
             raise ValueError(f"a <{tag}> of more than {_MOST_NUMBERS} numbers")
-        file = Path(attributes.get("file", "").replace("\0", "") or ".")
-        if file.exists() and not file.is_file() and not file.is_dir():
+        file = Path(attributes.get("file", "."))
+        if "file" in attributes and file.exists() and not file.is_file() and not file.is_dir():
             raise ValueError(f"a <{tag}> from {str(file)[:80]!r}, which is no regular file")
 
     parser = expat.ParserCreate()
