@@ -1,4 +1,4 @@
-"""What README.md says of schemes is what is measured, and what `experiments/survey.py` decides."""
+"""What the guide says of schemes is what is measured, and what `experiments/survey.py` decides."""
 
 import re
 import sys
@@ -8,6 +8,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parent.parent
+GUIDE = ROOT / "torchspline" / "docs" / "guides" / "choosing.md"
 sys.path.append(str(ROOT / "experiments"))
 
 from interpolation.choose import NEEDS, choices, page  # noqa: E402
@@ -24,16 +25,16 @@ def measured():
 
 
 def rows() -> dict[str, tuple[list[str], str]]:
-    """Of README's table of schemes: names and reasons by need."""
+    """Of the guide's table of schemes: names and reasons by need."""
     found = {}
-    for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines():
+    for line in GUIDE.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 3 and cells[0] in NEEDS:
             found[cells[0]] = (re.findall(r'`"([^"]+)"`', cells[1]), cells[2])
     return found
 
 
-def test_readme_table(measured):
+def test_table_of_the_guide(measured):
     told = rows()
     assert {need: names for need, (names, _) in told.items()} == choices(measured)
     for names, reason in told.values():

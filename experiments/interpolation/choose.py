@@ -8,7 +8,7 @@ from common import Table, markdown
 Measured = Mapping[str, Any]
 
 
-#: What somebody with keyframes may want, and which measured properties that is. README.md has the same rows.
+#: What somebody with keyframes may want, and which measured properties that is: the rows of guides/choosing.md.
 NEEDS: dict[str, Callable[[Measured], bool]] = {
     "keyframes met at constant speed in between": lambda x: x["interpolates"] and x["constant_speed"],
     "keyframes met, velocity continuous, local": lambda x: (
