@@ -436,7 +436,9 @@ def test_uniform_motion_is_reproduced(family):
         ):
             return  # blends of numbers do not turn steadily
         elif dict(curve.options).get("method") not in (None, "geodesic", "linear"):
-            at = curve.knots[0] + torch.arange(count, dtype=F64) * (curve.knots[-1] - curve.knots[0]) / (count - 1)
+            at = curve.knots[0] + torch.arange(count, dtype=F64) * (curve.knots[-1] - curve.knots[0]) / (
+                count - 1
+            )
         speed = tangents(group, [2.0], each=1, seed=seed)[0] / at.diff().max()
         start = group.random(generator=generator(seed))
 
