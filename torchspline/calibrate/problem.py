@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import RotationSpline
 from torch import Tensor
 
 from torchspline.calibrate.images import PROJECTIONS, ImageBlock
@@ -19,6 +19,7 @@ from torchspline.fit.residual import Clock, Residual
 from torchspline.fit.residuals import Accelerometer, Gyroscope
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, Group
+from torchspline.groups.convert import from_scipy, to_scipy
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
 from torchspline.units import SECOND
@@ -159,8 +160,8 @@ def _through(t: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:
     if len(t) == 1:
         return np.repeat(poses, len(at), axis=0)
     position = CubicSpline(t, poses[:, :3])(at)
-    rotation = RotationSpline(t, Rotation.from_quat(poses[:, 3:], scalar_first=True))(at)
-    return np.concatenate([position, rotation.as_quat(scalar_first=True)], axis=1)
+    rotation = RotationSpline(t, to_scipy(torch.from_numpy(poses[:, 3:])))(at)
+    return np.concatenate([position, from_scipy(rotation).numpy()], axis=1)
 
 
 def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None:

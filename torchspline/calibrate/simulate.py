@@ -12,6 +12,7 @@ from torchspline.calibrate.images import PROJECTIONS
 from torchspline.calibrate.recording import Corners, Recording
 from torchspline.fit.solving.kernel import kernel_of
 from torchspline.groups import SE3, Group
+from torchspline.groups.convert import from_scipy
 from torchspline.imu import ImuNoise, measure
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
@@ -133,7 +134,7 @@ def _mounting(cameras: int) -> tuple[Tensor, Tensor]:
     for i in range(cameras):
         rotation = turn * Rotation.from_rotvec([0.002 * i, 0.01 * i, -0.004 * i])
         position = turn.apply([0.11 * i, 0.0005 * i, -0.001 * i]) + np.array([-0.0216, -0.0647, 0.0098])
-        poses.append([*position, *rotation.as_quat(scalar_first=True)])
+        poses.append([*position, *from_scipy(rotation).tolist()])
     return torch.tensor(poses, dtype=torch.float64), torch.linspace(0.0041, 0.0046, cameras).double()
 
 
@@ -154,8 +155,8 @@ def _trajectory(
     # Looking down at the board: x to its right, y down, z away from whoever looks.
     facing = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     rotation = facing * Rotation.from_rotvec((turns * beats).sum(-1))
-    camera = np.concatenate([position, rotation.as_quat(scalar_first=True)], axis=1)
-    imu = SE3.compose(torch.from_numpy(camera), SE3.inverse(T_imu_cam))
+    camera = torch.cat([torch.from_numpy(position), from_scipy(rotation)], dim=1)
+    imu = SE3.compose(camera, SE3.inverse(T_imu_cam))
     group = Group(GROUPS[representation])
     return BSpline(imu, group=group, order=order, dt_ns=dt, t0_ns=start, learnable=False)
 
