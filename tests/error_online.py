@@ -81,7 +81,7 @@ _UPDATES = "SlidingWindow.update BatchProblem.solve"
 _PRIORS = "SlidingWindow.add_prior BatchProblem.add_prior"
 _ADD = "SlidingWindow.add BatchProblem.add"
 _HOLD = "BatchProblem.freeze BatchProblem.release"
-_OTHERS = f"{_PRIORS} SlidingWindow.random_walk BatchResult.covariance {_HOLD}"
+_OTHERS = f"{_PRIORS} BatchResult.covariance {_HOLD}"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {
@@ -100,10 +100,12 @@ NOT_APPLICABLE = {
         "no numbers that can be one": _HOLD,
     },
     "zero quaternion": {
-        "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} {_UPDATES} SlidingWindow.extend"
+        "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} SlidingWindow.random_walk {_UPDATES} SlidingWindow.extend"
     },
-    "count": {"any number": f"SlidingWindow.add {_OTHERS} {_UPDATES} SlidingWindow.extend"},
-    "time": {"no times": f"SlidingWindow BatchProblem {_OTHERS} {_UPDATES}"},
+    "count": {
+        "any number": f"SlidingWindow.add {_OTHERS} SlidingWindow.random_walk {_UPDATES} SlidingWindow.extend"
+    },
+    "time": {"no times": f"SlidingWindow BatchProblem {_OTHERS} SlidingWindow.random_walk {_UPDATES}"},
 }
 
 
@@ -193,8 +195,22 @@ def residuals() -> Iterator[Case]:
     spline = BSpline(V[0], group=R3, dt=1.0)
     wandering = Gyroscope(T, V[0, :3], bias=spline)
     yield refused(
-        function, "residual", "option", wandering, "got a BSpline", "a Variable or a tensor", "bias"
+        function, "residual", "option", wandering, "got a BSpline", "whose random walk is known", "bias"
     )
+    walk = "SlidingWindow.random_walk"
+    for bad, category, came, expected in (
+        (BSpline(V, group=R3, dt=1.0), "shape", "shape (2, 8, 3)", "without a batch"),
+        (BSpline(POSE[0], group=SE3, dt=1.0), "option", "got one in SE3", "a spline in R^n"),
+        (BSpline(V[0].to(F32), group=R3, dt=1.0), "dtype", "got torch.float32", "of float64"),
+        (BSpline(V[0], group=R3, dt_ns=10**8), "dtype", "got dt_ns", "the window's kind of time"),
+        (BSpline(V[0], group=R3, dt=1.0).to("meta"), "device", "got meta", "on the CPU"),
+    ):
+        yield refused(walk, "variable", category, bad, came, expected)
+    broken = BSpline(V[0], group=R3, dt=1.0)
+    with torch.no_grad():
+        broken.control_points[3, 1] = NAN
+    yield refused(walk, "variable", "nan", broken, "got nan at index (3, 1)", "finite")
+    yield refused(walk, "sigma", "shape", torch.ones(2, dtype=F64), "got (2,)", "shape (3,)", variable=spline)
     function = "BatchProblem.add"
     for bad in (None, [0, 1, 1]):
         yield refused(function, "trajectory", "type", bad, f"got {type(bad).__name__}", "int64 tensor")

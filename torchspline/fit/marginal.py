@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.fit.bends import Bends
+from torchspline.fit.bends import Bends, Walk
 from torchspline.fit.model import Model, State
 from torchspline.fit.priors import BoundPrior
 from torchspline.fit.system import BandSystem
@@ -16,7 +16,7 @@ Array = NDArray[Any]
 
 
 def normal_equations(
-    model: Model, terms: Sequence[Term | Bends | BoundPrior], state: State
+    model: Model, terms: Sequence[Term | Bends | Walk | BoundPrior], state: State
 ) -> tuple[Array, Array]:
     """`J^T J` (total, total) and `J^T r` (total,) of a few unknowns, dense."""
     system = BandSystem(model, model.trajectory.local.fused, model.band)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.bends import Bends
+from torchspline.fit.bends import Bends, Walk
 from torchspline.fit.implicit import differentiable as of_solution
 from torchspline.fit.model import Model, Spline, State, Unknown
 from torchspline.fit.priors import BoundPrior, Part, Prior
@@ -268,7 +268,7 @@ class Problem:
 class Linearizer:
     """From numbers of the unknowns to normal equations."""
 
-    def __init__(self, model: Model, terms: Sequence[Term | Bends | BoundPrior]):
+    def __init__(self, model: Model, terms: Sequence[Term | Bends | Walk | BoundPrior]):
         self.model, self.terms = model, list(terms)
         self.fused = model.trajectory.local.fused
         #: Of each term that touches the same unknowns wherever these stand: how far apart, and how many at a time.
@@ -280,7 +280,7 @@ class Linearizer:
             term.add_to(system, state)
         return system
 
-    def system_of(self, term: Term | Bends | BoundPrior, state: State) -> System:
+    def system_of(self, term: Term | Bends | Walk | BoundPrior, state: State) -> System:
         """What one of the terms has in the normal equations."""
         system = self._empty(state)
         term.add_to(system, state)
