@@ -82,6 +82,7 @@ _PRIORS = "SlidingWindow.add_prior BatchProblem.add_prior"
 _ADD = "SlidingWindow.add BatchProblem.add"
 _HOLD = "BatchProblem.freeze BatchProblem.release"
 _OTHERS = f"{_PRIORS} BatchResult.covariance {_HOLD}"
+_GROWS = "SlidingWindow.random_walk SlidingWindow.extend"
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {
@@ -100,11 +101,9 @@ NOT_APPLICABLE = {
         "no numbers that can be one": _HOLD,
     },
     "zero quaternion": {
-        "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} SlidingWindow.random_walk {_UPDATES} SlidingWindow.extend"
+        "no quaternion goes in that was not checked": f"{_ADD} {_OTHERS} {_GROWS} {_UPDATES}"
     },
-    "count": {
-        "any number": f"SlidingWindow.add {_OTHERS} SlidingWindow.random_walk {_UPDATES} SlidingWindow.extend"
-    },
+    "count": {"any number": f"SlidingWindow.add {_OTHERS} {_GROWS} {_UPDATES}"},
     "time": {"no times": f"SlidingWindow BatchProblem {_OTHERS} SlidingWindow.random_walk {_UPDATES}"},
 }
 
