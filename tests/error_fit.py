@@ -326,7 +326,7 @@ def clocks() -> Iterator[Case]:
             yield refused(
                 "Clock", name, "type", bad, f"got {type(bad).__name__}", "a torchspline.fit.Variable"
             )
-        for bad in (BIAS, fit.Variable("many", torch.zeros(4, 1))):
+        for bad in (BIAS, fit.Variable("many", torch.zeros(4, 2))):
             yield refused("Clock", name, "shape", bad, f"got Variable('{bad.name}'", "shape (1,)")
     for case in numbers("Clock", "mid"):
         if case.changes["mid"] is not None:
@@ -412,6 +412,13 @@ def problems() -> Iterator[Case]:
         TIMES, V[0], bias=fit.Variable("twin", torch.zeros(3)), scaling=fit.Variable("twin", torch.ones(9))
     )
     yield case("option", {"residual": batch}, "two called 'twin'", "one unknown of each name", "variable")
+    several = fit.Gyroscope(TIMES, V[0], bias=BSpline(V[:2], group=R3, dt=0.5))
+    yield case(
+        "shape", {"residual": several}, "got control points of shape (2, 8, 3)", "without a batch", "spline"
+    )
+    clock = fit.Clock(offset=fit.Variable("late", torch.zeros(2, 1)))
+    several = fit.Gyroscope(TIMES, V[0], clock=clock)
+    yield case("shape", {"residual": several}, "got Variable('late'", "for BatchProblem", "clock")
     states = fit.StateVelocity(TIMES, V[0])
     yield case("shape", {"residual": states}, "got (8, 3)", "expected shape (8, 6)", "measured")
 

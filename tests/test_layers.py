@@ -32,7 +32,7 @@ FIT_LAYERS = [
     {"residuals", "solving"},
     {"result", "smoothness"},
     {"problem"},
-    {"alignment", "online", "poses", "together"},
+    {"alignment", "batch", "online", "poses"},
     {"approximation"},
 ]
 FIT_RANK = {name: rank for rank, names in enumerate(FIT_LAYERS) for name in names}

@@ -3,6 +3,7 @@
 from torchspline.fit import residuals
 from torchspline.fit.alignment import Alignment, align_imu
 from torchspline.fit.approximation import Approximation, Difference, approximate, compare
+from torchspline.fit.batch import BatchProblem, BatchResult
 from torchspline.fit.losses import Cauchy, GemanMcClure, Huber, Loss
 from torchspline.fit.online import SlidingWindow
 from torchspline.fit.poses import PoseFit, fit_poses
@@ -11,7 +12,6 @@ from torchspline.fit.residual import Clock, Residual
 from torchspline.fit.residuals import *  # noqa: F403
 from torchspline.fit.result import Result
 from torchspline.fit.smoothness import smoothness
-from torchspline.fit.together import BatchProblem, BatchResult
 from torchspline.fit.variables import Variable
 
 __all__ = [

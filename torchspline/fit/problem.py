@@ -79,6 +79,12 @@ class Problem:
                     f"{slot}: {x.name} holds {len(x.value)}; expected {slot}=index, which of them each measurement "
                     "sees, got none"
                 )
+        for x in residual.clock.unknowns:
+            if x.value.ndim != 1:
+                raise ValueError(
+                    f"clock: expected a Variable of one number, shape (1,), got {x!r}; a row for each of several "
+                    "trajectories is for BatchProblem"
+                )
         self._check_times(residual)
         unknowns = [
             x

@@ -63,7 +63,7 @@ class Clock:
     domain take no part while they are there.
 
     Args:
-        offset, skew: unknowns of one number each, s and s/s.
+        offset, skew: unknowns of one number each, s and s/s; in a `BatchProblem` one for each trajectory, (B, 1).
         mid: time of the trajectory at which the skew turns, in the unit of its times; by default the middle of its
             domain.
         delay: an unknown of one number, s, such as the line delay of a rolling shutter. late: by how many delays the
@@ -85,7 +85,7 @@ class Clock:
             if x is None:
                 continue
             checks.instance(name, x, Variable, "a torchspline.fit.Variable")
-            if x.group is not None or x.value.shape != (1,):
+            if x.group is not None or x.size != 1:
                 raise ValueError(f"{name}: expected a Variable of one number, shape (1,), got {x!r}")
         if self.mid is not None:
             checks.finite_number("mid", self.mid)
@@ -347,9 +347,9 @@ def _argument(name: str, x: Any, slot: Slot, count: int) -> Argument:
                 f"{name}: expected a Variable of {slot.group or f'{slot.size} numbers'}, got {x!r}"
             )
     elif isinstance(x, BSpline):
-        if slot.group is not None or x.group.name != f"R{slot.size}" or x.control_points.ndim != 2:
+        if slot.group is not None or x.group.name != f"R{slot.size}":
             raise ValueError(
-                f"{name}: expected a spline in R{slot.size} without a batch, got one in {x.group} of shape "
+                f"{name}: expected a spline in R{slot.size}, got one in {x.group} of shape "
                 f"{tuple(x.control_points.shape)}"
             )
     elif isinstance(x, Tensor):

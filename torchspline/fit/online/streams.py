@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchspline.fit.residual import Argument, Clock, Residual, set_weighting
 from torchspline.fit.variables import Variable
+from torchspline.splines.bspline import BSpline
 from torchspline.units import seconds_since
 
 Array = NDArray[Any]
@@ -115,7 +116,7 @@ def _same(a: Any, b: Any) -> bool:
         return True
     if isinstance(a, Tensor) and isinstance(b, Tensor):
         return a.shape == b.shape and a.dtype == b.dtype and np.array_equal(a.detach(), b.detach())
-    if type(a) is not type(b) or isinstance(a, Variable):
+    if type(a) is not type(b) or isinstance(a, (Variable, BSpline)):
         return False
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)

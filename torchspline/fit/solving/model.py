@@ -41,8 +41,12 @@ class Spline:
         self.slack = 1e-9 + 8 * np.finfo(np.float64).eps * (rounding + self.segments)
         self._blending = np.array(blending_matrix(self.order), dtype=np.float64)
 
-    def place(self, tau: Array) -> tuple[Array, Array, Array]:
-        """First control point, position in the segment (clamped into the domain), and which times lie outside it."""
+    def place(self, tau: Array, which: Array | None = None) -> tuple[Array, Array, Array]:
+        """First control point, position in the segment (clamped into the domain), and which times lie outside it.
+
+        Args:
+            which: of splines laid end to end, the one that each time is of.
+        """
         s = (tau - self.start) / self.spacing
         base = np.clip(np.floor(s), 0, self.segments - 1)
         u = s - base

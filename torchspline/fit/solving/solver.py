@@ -19,7 +19,7 @@ Array = NDArray[Any]
 LEAST_DIAGONAL = 1e-12
 MOST_DAMPING = 1e12
 #: Shares of the cost below which its differences are noise.
-_ROUNDING = 1e-11
+ROUNDING = 1e-11
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def minimise(
             clock = trace.spend("linearize", clock)
             trace.evaluations += 1
             # A step that is short because of much damping proves nothing.
-            near = damping <= 1.0 and expected <= max(options.cost, _ROUNDING) * system.cost
+            near = damping <= 1.0 and expected <= max(options.cost, ROUNDING) * system.cost
             if gain <= 0 and near:
                 trace.reason, trace.converged = "no step lowers the cost any more", True
                 return state, system, trace
@@ -140,7 +140,7 @@ def _gain(before: System, after: System, expected: float) -> float:
     """
     if not math.isfinite(after.cost) or not expected > 0:
         return -1.0
-    if expected > _ROUNDING * before.cost:
+    if expected > ROUNDING * before.cost:
         return (before.cost - after.cost) / expected
     return 1.0 if _slope(after) < _slope(before) else -1.0
 

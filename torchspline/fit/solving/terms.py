@@ -64,13 +64,25 @@ class Differential(NamedTuple):
 
 
 class Term:
-    """A residual bound to the unknowns of a problem."""
+    """A residual bound to the unknowns of a problem.
 
-    def __init__(self, residual: Residual, model: Model, origin: float | int, index: dict[str, Array]):
+    Args:
+        which: for trajectories laid end to end, of which one each measurement is, (N,).
+    """
+
+    def __init__(
+        self,
+        residual: Residual,
+        model: Model,
+        origin: float | int,
+        index: dict[str, Array],
+        which: Array | None = None,
+    ):
         self.residual, self.model, self.origin = residual, model, origin
         kind = type(residual)
         tau = seconds_since(residual.t.detach().cpu().reshape(kind.moments, -1), origin).numpy()
-        self.order = np.argsort(tau[0], kind="stable")
+        self.order = np.argsort(tau[0], kind="stable") if which is None else np.lexsort((tau[0], which))
+        self.which = None if which is None else which[self.order]
         self.tau = np.ascontiguousarray(tau[:, self.order])
         mid, length = residual.clock.mid, model.trajectory.segments * model.trajectory.spacing
         self.mid = 0.5 * length if mid is None else seconds(mid, origin)
@@ -131,17 +143,18 @@ class Term:
             return self._places
         tau, rates = self._times(state)
         trajectory = self.model.trajectory
-        base, u, outside = map(list, zip(*(trajectory.place(t) for t in tau), strict=True))
+        base, u, outside = map(list, zip(*(trajectory.place(t, self.which) for t in tau), strict=True))
         own_base, own_u, keys = {}, {}, [*base]
         for slot, spline in self.splines.items():
-            own_base[slot], own_u[slot], _ = spline.place(self.tau[0])
+            own_base[slot], own_u[slot], _ = spline.place(self.tau[0], self.which)
             keys.append(own_base[slot])
         keys += self.index.values()
         starts = _runs(keys, len(self))
         first = starts[:-1]
         # A trajectory that stays as it is has no part in the equations.
         moving = [] if self.held else base
-        columns = [
+        columns = [np.empty((len(first), 0), np.int64)]
+        columns += [
             self.model.columns[id(trajectory.module)][b[first, None] + np.arange(trajectory.order)]
             for b in moving
         ]
@@ -152,7 +165,8 @@ class Term:
             own = self.model.columns[id(self.residual.arguments[slot])]
             rows = self.index[slot][first] if slot in self.index else np.zeros(len(first), np.int64)
             columns.append(own[rows])
-        columns += [np.broadcast_to(self.model.columns[id(v)], (len(first), 1)) for v in self.clock]
+        whose = np.zeros(len(first), np.int64) if self.which is None else self.which[first]
+        columns += [self.model.columns[id(v)][whose] for v in self.clock]
         blocks = [c.reshape(len(first), math.prod(c.shape[1:])) for c in columns]
         bases = (
             np.stack([b[first] for b in moving], axis=1) if moving else np.empty((len(first), 0), np.int64)
@@ -170,20 +184,19 @@ class Term:
     def _times(self, state: State) -> tuple[Array, list[tuple[Variable, Array]]]:
         """Times of the trajectory, and how they move with the unknowns of the clock."""
         clock = self.residual.clock
-        numbers = {
-            id(v): state.values[id(v)][0] for v in (clock.offset, clock.skew, clock.delay) if v is not None
-        }
+        whose = 0 if self.which is None else torch.from_numpy(self.which)
+        numbers = {id(v): state.values[id(v)].reshape(-1)[whose] for v in clock.unknowns}
         tau = self.clocked(
             torch.from_numpy(self.tau), numbers, lambda late: late[torch.from_numpy(self.order)]
         ).numpy()
-        rate = 1.0 if clock.skew is None else 1.0 + float(numbers[id(clock.skew)])
+        rate = 1.0 if clock.skew is None else 1.0 + numbers[id(clock.skew)].numpy()
         rates: list[tuple[Variable, Array]] = []
         for part in ("offset", "skew", "delay"):  # by their names: one variable may be several of them
             v = getattr(clock, part)
             if v is None or id(v) not in self.model.columns:
                 continue
             if part == "offset":
-                rates.append((v, np.full_like(tau, -1.0 / rate)))
+                rates.append((v, np.broadcast_to(-1.0 / rate, tau.shape)))
             elif part == "skew":
                 rates.append((v, -(tau - self.mid) / rate))
             else:
