@@ -2,7 +2,7 @@
 
 A residual is written once, on tuples of components (`arithmetic/`), as a function and its hand-derived reverse; from
 those two come the compiled loop, the reference on tensors, the rows of the Jacobian (the reverse of each unit vector)
-and the graph that a differentiable optimum needs. A new residual is one file in `residuals/` and one line in its
+and the graph that a differentiable optimum needs. A new residual is one file in `residuals/` and its name in their
 `__init__`; the tests then compare its reverse with automatic differentiation unasked.
 """
 

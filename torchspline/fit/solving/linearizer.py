@@ -18,7 +18,7 @@ _WIDEST_BAND = 6
 
 
 class CostTerm(Protocol):
-    """A term of the cost: a residual (`Term`), what is known beforehand (`BoundPrior`), smoothness (`Bends`, `Walk`)."""
+    """A term of the cost: a residual (`Term`), smoothness (`Bends`, `Walk`) or earlier knowledge (`BoundPrior`)."""
 
     def touched(self, state: State) -> Array:
         """Columns of the unknowns (runs, C) that a run of its rows ties together; -1 for those that stay."""
