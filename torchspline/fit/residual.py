@@ -55,6 +55,11 @@ class Moment(NamedTuple):
     rates: tuple[Vector, ...]
 
 
+#: The arguments of a residual by slot, points of groups unit; and their cotangents, those of points body tangents.
+Given = Mapping[str, Vector]
+Cotangents = dict[str, Vector]
+
+
 @dataclass(frozen=True, eq=False)
 class Clock:
     """How the stamps of a sensor relate to the time of the trajectory.
@@ -212,19 +217,14 @@ class Residual(ABC):
 
     @abstractmethod
     def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
     ) -> Vector:
         """The residual, R components, not weighted. `given` holds points of groups as unit ones."""
 
     @abstractmethod
     def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+    ) -> tuple[list[Moment], Cotangents]:
         """Cotangents of what the residual depends on, from its own: a moment for each of `at`, and those of `given`."""
 
     def __len__(self) -> int:

@@ -1,12 +1,11 @@
 """What an accelerometer on the body reads."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion, attached, attached_reverse
 from torchspline.arithmetic.so3 import rotate, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate
-from torchspline.fit.residual import LEVER_ARM, Slot
+from torchspline.fit.residual import LEVER_ARM, Cotangents, Given, Slot
 from torchspline.fit.residuals.motion import MotionResidual
 from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 from torchspline.imu.synthesis import STANDARD_GRAVITY
@@ -28,18 +27,18 @@ class Accelerometer(MotionResidual):
         "lever_arm": LEVER_ARM,
     }
 
-    def _force(self, motion: Motion, given: Mapping[str, Vector]) -> tuple[Vector, Vector]:
+    def _force(self, motion: Motion, given: Given) -> tuple[Vector, Vector]:
         """Gravity and the specific force at the sensor, in the body frame."""
         fall = unrotate(motion.q, given["gravity"])
         return fall, add(attached(motion, given["lever_arm"]).a, negate(fall))
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         _, force = self._force(motion, given)
         return add(reading(given, force), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         fall, force = self._force(motion, given)
         force_g, cotangents = reading_reverse(given, force, g)
         motion_g, cotangents["lever_arm"] = attached_reverse(motion, given["lever_arm"], Motion(a=force_g))

@@ -1,10 +1,10 @@
 """Measured rates of rotation: what a gyroscope on the body reads, and the derivative of that."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion
 from torchspline.arithmetic.vector import Vector, add, negate
+from torchspline.fit.residual import Cotangents, Given
 from torchspline.fit.residuals.motion import MotionResidual
 from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 
@@ -18,12 +18,12 @@ class _AngularRate(MotionResidual):
     #: Name of the field.
     rate: ClassVar[str]
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(reading(given, getattr(motion, self.rate)), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         rate_g, cotangents = reading_reverse(given, getattr(motion, self.rate), g)
         return Motion(**{self.rate: rate_g}), cotangents
 

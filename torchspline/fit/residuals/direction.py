@@ -1,12 +1,11 @@
 """A vector of the world seen from the body: the magnetic field, the sun, the vertical."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion
 from torchspline.arithmetic.so3 import rotate, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate
-from torchspline.fit.residual import Slot
+from torchspline.fit.residual import Cotangents, Given, Slot
 from torchspline.fit.residuals.motion import MotionResidual
 from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
 
@@ -24,12 +23,12 @@ class Direction(MotionResidual):
     moves = False
     slots: ClassVar = {"direction": Slot(3, None, None), **TRIAD}
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(reading(given, unrotate(motion.q, given["direction"])), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         inside = unrotate(motion.q, given["direction"])
         inside_g, cotangents = reading_reverse(given, inside, g)
         cotangents["direction"] = rotate(motion.q, inside_g)

@@ -1,13 +1,13 @@
 """Residuals of the motion of a rigid body: its pose, velocities and accelerations, whichever group carries it."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 from torchspline.arithmetic.group import GroupArithmetic
 from torchspline.arithmetic.motion import MOTIONS, Motion
 from torchspline.arithmetic.vector import Vector
-from torchspline.fit.residual import Moment, Residual, needs
+from torchspline.fit.residual import Cotangents, Given, Moment, Residual, needs
 from torchspline.groups.group import Group
 
 
@@ -27,28 +27,23 @@ class MotionResidual(Residual):
         needs(cls.__name__, group, cls.rotates, cls.moves)
 
     @abstractmethod
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         """The residual, as `Residual.evaluate`."""
 
     @abstractmethod
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         """Cotangents of the motion and of `given`, from that of the residual."""
 
     def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
     ) -> Vector:
         return self.error(MOTIONS[group.name].motion(at[0].value, at[0].rates), given, measured)
 
     def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+    ) -> tuple[list[Moment], Cotangents]:
         mechanics, (value, rates) = MOTIONS[group.name], at[0]
         motion = mechanics.motion(value, rates)
         motion_g, given_g = self.error_reverse(motion, given, measured, g)

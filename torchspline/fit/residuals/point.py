@@ -1,11 +1,10 @@
 """A landmark whose place a sensor measures in three dimensions: depth cameras, lidar, beacons."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion, sighted, sighted_reverse
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import POSE_IN_BODY, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given, Slot
 from torchspline.fit.residuals.motion import MotionResidual
 
 
@@ -23,11 +22,11 @@ class Point(MotionResidual):
         "T_body_sensor": POSE_IN_BODY,
     }
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(sighted(motion, given["T_body_sensor"], given["landmark"]), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         motion_g, T_g, landmark_g = sighted_reverse(motion, given["T_body_sensor"], given["landmark"], g)
         return motion_g, {"landmark": landmark_g, "T_body_sensor": T_g}

@@ -1,13 +1,12 @@
 """A measured pose of the body, or of a sensor on it."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion, attached, attached_reverse
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.so3 import conjugate, multiply, rotate, unit, unrotate
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import POSE_IN_BODY
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given
 from torchspline.fit.residuals.motion import MotionResidual
 
 
@@ -24,15 +23,15 @@ class Pose(MotionResidual):
     measured_signs = ((3, 7),)
     slots: ClassVar = {"T_body_sensor": POSE_IN_BODY}
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         T = given["T_body_sensor"]
         position = attached(motion, T[:3]).p
         missed = multiply(conjugate(unit(measured[3:])), multiply(motion.q, T[3:]))
         return (*add(position, negate(measured[:3])), *arithmetic("SO3").log(missed))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         T, error = given["T_body_sensor"], self.error(motion, given, measured)[3:]
         turn_g = arithmetic("SO3").right_jacobian_inverse_transpose(error, g[3:], short=True)
         motion_g, arm_g = attached_reverse(motion, T[:3], Motion(p=g[:3]))

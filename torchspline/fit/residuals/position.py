@@ -1,11 +1,10 @@
 """A measured position of a point of the body: motion capture markers, satellite navigation."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion, attached, attached_reverse
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import LEVER_ARM
+from torchspline.fit.residual import LEVER_ARM, Cotangents, Given
 from torchspline.fit.residuals.motion import MotionResidual
 
 
@@ -21,11 +20,11 @@ class Position(MotionResidual):
     rotates = False
     slots: ClassVar = {"lever_arm": LEVER_ARM}
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(attached(motion, given["lever_arm"]).p, negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         motion_g, arm_g = attached_reverse(motion, given["lever_arm"], Motion(p=g))
         return motion_g, {"lever_arm": arm_g}

@@ -1,12 +1,11 @@
 """Where a camera sees a landmark, in pixels."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.camera import CAMERA_MODELS, CameraModel
 from torchspline.arithmetic.motion import Motion, sighted, sighted_reverse
 from torchspline.arithmetic.vector import Vector, add, negate, scale, times
-from torchspline.fit.residual import POSE_IN_BODY, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given, Slot
 from torchspline.fit.residuals.motion import MotionResidual
 
 
@@ -21,7 +20,7 @@ class _Reprojection(MotionResidual):
     }
     camera: ClassVar[CameraModel]
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         intrinsics = given["intrinsics"]
         point, shown = self.camera.visible(sighted(motion, given["T_body_camera"], given["landmark"]))
         x, y = self.camera.distort(point, intrinsics[4:])
@@ -29,8 +28,8 @@ class _Reprojection(MotionResidual):
         return scale(shown, add(pixel, intrinsics[2:4], negate(measured)))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         intrinsics = given["intrinsics"]
         point, shown = self.camera.visible(sighted(motion, given["T_body_camera"], given["landmark"]))
         x, y = self.camera.distort(point, intrinsics[4:])

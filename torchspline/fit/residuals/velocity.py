@@ -1,12 +1,11 @@
 """A measured velocity of a point of the body, against the world: in the world's axes, or in those of the sensor."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 from torchspline.arithmetic.motion import Motion, attached, attached_reverse, turned, turned_reverse
 from torchspline.arithmetic.so3 import rotate, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate
-from torchspline.fit.residual import LEVER_ARM, ROTATION_IN_BODY
+from torchspline.fit.residual import LEVER_ARM, ROTATION_IN_BODY, Cotangents, Given
 from torchspline.fit.residuals.motion import MotionResidual
 
 
@@ -21,12 +20,12 @@ class WorldVelocity(MotionResidual):
     rotates = False
     slots: ClassVar = {"lever_arm": LEVER_ARM}
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(rotate(motion.q, attached(motion, given["lever_arm"]).v), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         v, v_g = attached(motion, given["lever_arm"]).v, unrotate(motion.q, g)
         motion_g, arm_g = attached_reverse(motion, given["lever_arm"], Motion(v=v_g))
         # R Exp(x) v = R (v + x x v), and g . R (x x v) = x . (v x R^T g)
@@ -43,12 +42,12 @@ class BodyVelocity(MotionResidual):
     rows, measured_size, derivatives = 3, 3, 1
     slots: ClassVar = {"rotation": ROTATION_IN_BODY, "lever_arm": LEVER_ARM}
 
-    def error(self, motion: Motion, given: Mapping[str, Vector], measured: Vector) -> Vector:
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(turned(given["rotation"], attached(motion, given["lever_arm"]).v), negate(measured))
 
     def error_reverse(
-        self, motion: Motion, given: Mapping[str, Vector], measured: Vector, g: Vector
-    ) -> tuple[Motion, dict[str, Vector]]:
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         seen = turned(given["rotation"], attached(motion, given["lever_arm"]).v)
         rotation_g, v_g = turned_reverse(given["rotation"], seen, g)
         motion_g, arm_g = attached_reverse(motion, given["lever_arm"], Motion(v=v_g))
