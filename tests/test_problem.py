@@ -30,8 +30,8 @@ from torchspline.fit import (
     StateValue,
     Variable,
     smoothness,
-    terms,
 )  # fmt: skip
+from torchspline.fit.solving import terms
 from torchspline.fit.solving.system import BandSystem
 
 # ---------------------------------------------------------------------- each residual
