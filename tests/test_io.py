@@ -21,7 +21,7 @@ floats = st.floats(allow_infinity=False)
 
 
 @given(stamps, st.lists(floats, min_size=7, max_size=7), st.sampled_from(["", ".gz"]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_what_is_written_is_read_back_to_the_last_digit(time_ns, row, suffix):
     values = torch.tensor([row] * len(time_ns), dtype=torch.float64)
     values[:, 3] = 1.0  # no zero quaternion
