@@ -296,6 +296,9 @@ def priors() -> Iterator[Case]:
 def covariances() -> Iterator[Case]:
     for function in ("Result.covariance", "Result.standard_deviation"):
         for bad in (None, "bias", SPLINE):
+            if bad is SPLINE and function.endswith("deviation"):
+                yield refused(function, "variable", "option", bad, "BSpline(SE3", "that were solved for")
+                continue
             yield refused(function, "variable", "type", bad, f"got {type(bad).__name__}", "fit.Variable")
         yield refused(
             function, "variable", "option", MAP, "map is not among", "unknowns that were solved for"
@@ -305,6 +308,11 @@ def covariances() -> Iterator[Case]:
     yield refused(function, "t", "shape", T[None], "got (1, 3)", "expected shape (N,)")
     for bad in (4, -1, True, 1.0, None):
         yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+    yield refused(
+        function, "stretch", "option", 0.2, "got 0.2", "at most the knot spacing of the spline, 0.1 s"
+    )
+    for number in (0.0, -1.0, NAN):
+        yield refused(function, "stretch", "option", number, f"got {number}", "above zero")
 
 
 def variables() -> Iterator[Case]:

@@ -22,7 +22,8 @@ from torchspline.calibrate.start import Start, find_start
 from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
 from torchspline.fit.losses import Huber, Loss
 from torchspline.fit.residual import Residual
-from torchspline.fit.result import OpenDirection, Result, control_point_deviation
+from torchspline.fit.result import OpenDirection, Result
+from torchspline.fit.solving.model import spacing_of
 from torchspline.fit.solving.solver import Options as Solver
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
@@ -211,6 +212,7 @@ def calibrate(
         stretch: s. Standard deviations hold when errors are alike over stretches of this length, see
             `Result.standard_deviation`: biases that wander, a distortion that is not quite the lens's, corners that are
             all seen too far inside. On real recordings those are ten times what independent errors (None) would give.
+            For biases that are splines no longer than `bias_spacing`.
         max_iterations, cost_tolerance: of the solver, see `fit.Problem.solve`.
         progress: show a progress bar on a terminal.
     Returns:
@@ -256,11 +258,6 @@ def calibrate(
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
     notes = _notes(result, start)
-    if stretch is not None and not result.banded:
-        stretch = None
-        notes.append(
-            "standard deviations hold for independent errors only: there are too many unknowns for stretches"
-        )
     found = _Found(layout, result, stretch, stated, layout.frozen)
     cameras = tuple(_camera(recording, found, i) for i in range(len(recording.cameras)))
     imus = tuple(_imu(found, i) for i in range(len(recording.imus)))
@@ -347,8 +344,11 @@ class _Found(NamedTuple):
     stated: dict[str, float]
     frozen: list[Variable]
 
-    def sigma(self, variable: Variable) -> Tensor:
-        return self.result.standard_deviation(variable, self.stretch)
+    def sigma(self, variable: Variable | BSpline) -> Tensor:
+        stretch = self.stretch
+        if stretch is not None and isinstance(variable, BSpline):
+            stretch = min(stretch, spacing_of(variable))
+        return self.result.standard_deviation(variable, stretch)
 
     def sigma_if(self, variable: Variable | None) -> Tensor | None:
         """None if it was not estimated."""
@@ -390,11 +390,7 @@ def _imu(found: _Found, i: int) -> CalibratedImu:
         if isinstance(x, Variable):
             fields |= {kind: x.value, f"{kind}_sigma": found.sigma(x)}
         else:
-            fields |= {
-                kind: x.control_points.detach(),
-                f"{kind}_sigma": control_point_deviation(found.result, x),
-            }
-            fields[f"{kind}_spline"] = x
+            fields |= {kind: x.control_points.detach(), f"{kind}_spline": x, f"{kind}_sigma": found.sigma(x)}
     for kind, y in (("gyro_scaling", unknowns.gyro_scaling), ("accel_scaling", unknowns.accel_scaling)):
         if y is not None:
             fields |= {kind: y.value.reshape(3, 3), f"{kind}_sigma": found.sigma(y).reshape(3, 3)}
