@@ -6,6 +6,8 @@ from functools import partial
 from typing import Any, get_args, get_origin, get_type_hints
 
 _NONE = inspect.Parameter.empty
+#: The same for all commands.
+STATUS = "exit status: 0 all is well, 1 a check failed, 2 bad input or a file that cannot be written, 130 interrupted"
 
 
 class Mistake(ValueError):
@@ -38,7 +40,7 @@ def parse(
     parser = ArgumentParser(
         prog=program,
         description=docstring.short_description,
-        epilog=f"examples:\n{_indented(examples)}" if examples else None,
+        epilog=f"examples:\n{_indented(examples)}\n\n{STATUS}" if examples else STATUS,
         formatter_class=Formatter,
         exit_on_error=False,
     )

@@ -28,6 +28,8 @@ torchspline demo
 torchspline demo --duration 60 --seed 3 --out DIR --json
 """
 
+_LONGEST = 1e5  # s, of which there are 12 million poses
+
 
 def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int = 0) -> Report:
     """From a known motion to noisy poses, a fitted spline and its IMU signal, checked against the truth.
@@ -37,8 +39,8 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         duration: length of the motion, s.
         seed: of the random motion and noise.
     """
-    if duration < 2.0:
-        raise ValueError(f"duration: expected at least 2 s, got {duration}")
+    if not 2.0 <= duration <= _LONGEST:
+        raise ValueError(f"duration: expected at least 2 s and at most {_LONGEST:g} s, got {duration}")
     out.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(seed)
     truth = _random_motion(duration, generator)

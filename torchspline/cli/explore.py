@@ -11,7 +11,7 @@ from torchspline.explore import METHODS, Explorer
 
 EXAMPLES = """
 torchspline explore
-torchspline explore poses.txt --keyframes 12 --methods SQUAD "SPLIT CuBsp" "squad on SE3"
+torchspline explore --file poses.txt --keyframes 12 --methods SQUAD "SPLIT CuBsp" "squad on SE3"
 torchspline explore --figure methods.png      # draws the figure and ends
 """
 

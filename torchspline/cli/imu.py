@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchspline.cli.common import (
+    MOST_SECONDS,
     NS,
     excerpt,
     fit_report,
@@ -18,7 +19,7 @@ from torchspline.cli.common import (
     write_report,
     write_results,
 )
-from torchspline.cli.files import PoseFormat, open_poses
+from torchspline.cli.files import PoseFormat, open_poses, seconds_of
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
@@ -79,14 +80,14 @@ def imu(
     """
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
-    if not margin >= 0:
+    if not 0 <= margin < MOST_SECONDS:
         raise ValueError(f"margin: expected seconds, zero or more, got {margin}")
     record = open_poses(poses, format, times, topic, child)
     recording = None if recorded is None else read_imu(recorded, topic=recorded_topic)
     record = longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
     interval = record.time_ns.unique().diff().to(torch.float64).median().item() / NS
-    dt = 5 * interval if spacing is None else spacing * 1e-3
+    dt = 5 * interval if spacing is None else seconds_of(spacing)
     fit = fit_poses(
         record.time_ns,
         torch.cat([record.position, record.rotation], -1),
