@@ -37,7 +37,7 @@ COMMANDS: dict[str, Command] = {
     "bench": Command(f"{_HERE}.bench", "bench", "how long the main calls take on this machine"),
     "view": Command(f"{_HERE}.view", "view", "a page with an interactive 3D view of a file"),
     "explore": Command(f"{_HERE}.explore", "explore", "compare interpolation methods in the browser"),
-    "convert": Command(f"{_HERE}.convert", "convert", "between file formats of poses"),
+    "convert": Command(f"{_HERE}.convert", "convert", "between file formats of poses and IMU readings"),
     "info": Command(f"{_HERE}.info", "info", "what is in a file"),
     "kernels show": Command(f"{_HERE}.kernels", "show", "the source of a compiled loop"),
 }

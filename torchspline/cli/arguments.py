@@ -19,9 +19,10 @@ def parse(
 ) -> tuple[Callable[[], Any], bool]:
     """The call that `words` ask for, and whether they ask for JSON.
 
-    Parameters without a default are positional, in order, unless some are keyword-only; all others are options. Lists
-    take several words, truth values may stand alone, hyphens do for underscores. `--config FILE` reads options from
-    YAML and `--json` asks for JSON, unless the function has a parameter of that name.
+    Parameters without a default are positional, in order, unless some are keyword-only; all others are options, of
+    which one that stands before keyword-only ones may be the first word, without its name. Lists take several words,
+    truth values may stand alone, hyphens do for underscores. `--config FILE` reads options from YAML and `--json` asks
+    for JSON, unless the function has a parameter of that name.
 
     Raises:
         Mistake: words that do not fit.
@@ -59,6 +60,9 @@ def parse(
         )  # fmt: skip
     named = any(x.kind is inspect.Parameter.KEYWORD_ONLY for x in parameters.values())
     parser.add_function_arguments(function, as_group=False, as_positional=not named, skip=set(lists))
+    first = next((x.name for x in parameters.values() if x.kind is x.POSITIONAL_OR_KEYWORD), None)
+    if named and first and words and not words[0].startswith("-"):
+        words = [f"--{first}={words[0]}", *words[1:]]
     switches = {name for name in parameters if hints.get(name) is bool}
     try:
         chosen = parser.parse_args(_spelled_out(words, switches, {*parameters, "config"}))
