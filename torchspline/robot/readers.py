@@ -276,8 +276,8 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
         on = called(int(site.bodyid[0]))
         frames.append(Frame(site.name or f"site{s}", on, transform(site.pos, _matrix(site.quat))))
     for frame in frames:
-        moves = [np.append(move.screw, move.offset) for move in frame.moves]
-        if not all(np.isfinite(x).all() for x in (frame.pose, *moves)):
+        numbers = [frame.pose, *(np.append(move.screw, move.offset) for move in frame.moves)]
+        if not all(np.isfinite(x).all() for x in numbers):
             raise ValueError(
                 f"source: {frame.name!r} has a pose or joint that is not finite; expected numbers"
             )
