@@ -164,6 +164,10 @@ def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, R
 
     io.write_rosbag(folder / "both", {"/pose": record, "/imu": imu})
     mcap = Sample("both.mcap", (folder / "both" / "both.mcap").read_bytes())
+    trees = []
+    for name in ("tree.mcap", "tree.bag"):
+        io.write_rosbag(folder / name, {"/tf": record}, "TFMessage")
+        trees.append(Sample(name, (folder / name).read_bytes()))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     old = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     kind = "geometry_msgs/msg/PoseStamped"
@@ -180,6 +184,7 @@ def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, R
     (database,) = (folder / "sqlite").glob("*.db3")
     return {
         "read_poses, ROS 2 MCAP": Reader(io.read_poses, [mcap]),
+        "read_poses, ROS transforms": Reader(io.read_poses, trees),
         "read_imu, ROS 2 MCAP": Reader(io.read_imu, [mcap]),
         "read_poses, ROS 2 SQLite": Reader(io.read_poses, [Sample("x.db3", database.read_bytes())]),
         "read_poses, ROS 1": Reader(io.read_poses, [Sample("old.bag", (folder / "old.bag").read_bytes())]),

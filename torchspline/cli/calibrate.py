@@ -11,6 +11,7 @@ from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.reading import read_recording
 from torchspline.calibrate.results import FILES, write_calibration
 from torchspline.calibrate.start import find_start
+from torchspline.cli.common import MOST_SECONDS
 from torchspline.cli.report import Report
 
 EXAMPLES = """
@@ -62,7 +63,7 @@ def camera_imu(
     """
     if not (math.isfinite(spacing) and spacing > 0):
         raise ValueError(f"spacing: expected a finite number above zero (ms), got {spacing}")
-    if not (math.isfinite(start) and start >= 0):
+    if not 0 <= start < MOST_SECONDS:
         raise ValueError(f"start: expected seconds, zero or more, got {start}")
     if not duration > 0:
         raise ValueError(f"duration: expected seconds above zero, got {duration}")

@@ -17,6 +17,9 @@ from torchspline.io.archive import replacing, write_bytes
 from torchspline.splines import Trajectory
 from torchspline.units import SECOND
 
+#: Longer than any recording, s: stamps are 64 bits of nanoseconds.
+MOST_SECONDS = 9e9
+
 
 def longest_stretch(record: PoseRecord, gap: float | None, start: float, duration: float) -> PoseRecord:
     """The longest run of usable poses without a larger gap, cut to `start` and `duration`."""
@@ -31,16 +34,20 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
         )
     steps = time.diff()
     median = steps.to(torch.float64).median().item()
+    if gap is not None and not gap > 0:
+        raise ValueError(f"gap: expected milliseconds above zero, got {gap}")
     largest = max(0.03 * SECOND, 3 * median) if gap is None else gap * 1e6
     edges = [0, *(torch.nonzero(steps > largest).flatten() + 1).tolist(), len(time)]
     low, high = max(
         ((int(time[a]), int(time[b - 1])) for a, b in pairwise(edges)),
         key=lambda stretch: stretch[1] - stretch[0],
     )
-    if not (math.isfinite(start) and start >= 0):
+    if not 0 <= start < MOST_SECONDS:
         raise ValueError(f"start: expected seconds, zero or more, got {start}")
+    if not duration > 0:
+        raise ValueError(f"duration: expected seconds above zero, got {duration}")
     low += round(start * SECOND)
-    if math.isfinite(duration):
+    if duration < MOST_SECONDS:
         high = min(high, low + round(duration * SECOND))
     if low >= high:
         raise ValueError(

@@ -23,9 +23,9 @@ from torchspline.splines import Trajectory
 EXAMPLES = """
 torchspline convert data.csv poses.txt                   # EuRoC to TUM
 torchspline convert 00.txt 00_euroc.csv --times times.txt  # KITTI to EuRoC
-torchspline convert poses.txt kitti/poses.txt --to kitti  # and kitti/times.txt
+torchspline convert data.csv 07_gt.txt --to kitti        # to KITTI, with 07_times.txt
 torchspline convert motion.npz poses.txt --rate 100      # a saved trajectory, sampled
-torchspline convert walk.bvh hips.csv --joint Hips       # motion capture
+torchspline convert walk.bvh head.csv --joint Head       # motion capture
 torchspline convert drive.bag odometry.txt --topic /odom  # a bag of ROS
 torchspline convert motion.npz motion.rrd                # for the viewer of rerun
 gunzip -c poses.txt.gz | torchspline convert - - --to euroc > data.csv

@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 
 from torchspline.cli.common import (
-    SECOND,
     excerpt,
     fit_report,
     fit_rows,
@@ -22,11 +21,14 @@ from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline demo
 torchspline demo --duration 60 --seed 3 --out DIR --json
 """
+
+_LONGEST = 1e5  # s, of which there are 12 million poses
 
 
 def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int = 0) -> Report:
@@ -37,8 +39,8 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         duration: length of the motion, s.
         seed: of the random motion and noise.
     """
-    if duration < 2.0:
-        raise ValueError(f"duration: expected at least 2 s, got {duration}")
+    if not 2.0 <= duration <= _LONGEST:
+        raise ValueError(f"duration: expected at least 2 s and at most {_LONGEST:g} s, got {duration}")
     out.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(seed)
     truth = _random_motion(duration, generator)

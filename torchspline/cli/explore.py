@@ -17,8 +17,8 @@ torchspline explore --figure methods.png      # draws the figure and ends
 
 
 def explore(
-    *,
     file: Path | None = None,
+    *,
     keyframes: int = 8,
     methods: list[str] | None = None,
     format: Literal["tum", "euroc", "kitti", "ros"] | None = None,
@@ -34,7 +34,7 @@ def explore(
     Serves a page until it is interrupted (Ctrl-C).
 
     Args:
-        file: poses or a saved trajectory (.npz) to take keyframes from.
+        file: poses or a saved trajectory (.npz) to take keyframes from; may stand alone, as the first word.
         keyframes: how many of them.
         methods: shown at the start; names of interpolate, or "squad on SE3".
         format: of the poses; by default recognised from their content.

@@ -19,6 +19,8 @@ from torchspline.splines import Trajectory
 from torchspline.units import SECOND
 
 PoseFormat = Literal["tum", "euroc", "kitti", "nerfstudio", "bvh", "ros"]
+#: The widest spacing of knots, ms: a hundred days. Stamps are 64 bits of nanoseconds.
+_WIDEST = 1e10
 #: What stands for standard input and output.
 PIPE = Path("-")
 
@@ -136,10 +138,17 @@ def fitted(
     poses = torch.cat([used.position, used.rotation], -1)
     dt: float | Literal["auto"] = "auto"
     if not isinstance(spacing, str):
-        if not 0 < spacing < float("inf"):
-            raise ValueError(f"spacing: expected a finite number above zero (ms) or auto, got {spacing}")
-        dt = spacing * 1e-3
+        dt = seconds_of(spacing)
     return used, fit_poses(used.time_ns, poses, dt=dt, order=order, representation=representation)
+
+
+def seconds_of(spacing: float) -> float:
+    """The knot spacing of a command line, ms, in s."""
+    if not 0 < spacing <= _WIDEST:
+        raise ValueError(
+            f"spacing: expected a number above zero (ms), at most {_WIDEST:g}, or auto, got {spacing}"
+        )
+    return spacing * 1e-3
 
 
 def sampled(trajectory: Trajectory, rate: float, source: str) -> PoseRecord:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchspline.cli.common import (
-    SECOND,
+    MOST_SECONDS,
     excerpt,
     fit_report,
     fit_rows,
@@ -18,13 +18,14 @@ from torchspline.cli.common import (
     write_report,
     write_results,
 )
-from torchspline.cli.files import PoseFormat, open_poses
+from torchspline.cli.files import PoseFormat, open_poses, seconds_of
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
 from torchspline.io import ImuRecord, read_imu
 from torchspline.io.archive import replacing
 from torchspline.plot import imu_comparison
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline imu poses.txt --rate 200 --out DIR
@@ -79,14 +80,14 @@ def imu(
     """
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
-    if not margin >= 0:
+    if not 0 <= margin < MOST_SECONDS:
         raise ValueError(f"margin: expected seconds, zero or more, got {margin}")
     record = open_poses(poses, format, times, topic, child)
     recording = None if recorded is None else read_imu(recorded, topic=recorded_topic)
     record = longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
     interval = record.time_ns.unique().diff().to(torch.float64).median().item() / SECOND
-    dt = 5 * interval if spacing is None else spacing * 1e-3
+    dt = 5 * interval if spacing is None else seconds_of(spacing)
     fit = fit_poses(
         record.time_ns,
         torch.cat([record.position, record.rotation], -1),

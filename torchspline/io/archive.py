@@ -119,8 +119,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write an npz archive under exactly this name. Raises `FileNotFoundError` where the folder does not exist."""
-    with replacing(path) as part, part.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    packed = io.BytesIO()  # archives go back to their beginning, which pipes cannot
+    np.savez(packed, allow_pickle=False, **arrays)
+    with replacing(path) as part:
+        part.write_bytes(packed.getbuffer())
 
 
 def check_folder(path: Path) -> None:

@@ -276,11 +276,7 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
         on = called(int(site.bodyid[0]))
         frames.append(Frame(site.name or f"site{s}", on, transform(site.pos, _matrix(site.quat))))
     for frame in frames:
-        numbers: tuple[Any, ...] = (
-            frame.pose,
-            *(move.screw for move in frame.moves),
-            *(move.offset for move in frame.moves),
-        )
+        numbers = [frame.pose, *(np.append(move.screw, move.offset) for move in frame.moves)]
         if not all(np.isfinite(x).all() for x in numbers):
             raise ValueError(
                 f"source: {frame.name!r} has a pose or joint that is not finite; expected numbers"
