@@ -8,9 +8,9 @@ import torch
 from numpy.testing import assert_allclose
 
 import torchspline as ts
-from torchspline.fit import problem as problems
 from torchspline.fit.problem import Problem
 from torchspline.fit.residuals import Gyroscope, Orientation, Pose, StateValue
+from torchspline.fit.solving import linearizer as linearizers
 from torchspline.fit.solving.scatter import Scatter
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3
@@ -51,7 +51,7 @@ def pieces(start, chosen=slice(None), frozen=True):
 @pytest.mark.parametrize("sparse", [False, True])
 def test_pulls_of_stretches_are_those_of_dense_equations(sparse, monkeypatch):
     if sparse:
-        monkeypatch.setattr(problems, "_WIDEST_BORDER", -1)
+        monkeypatch.setattr(linearizers, "_WIDEST_BORDER", -1)
     start = SE3.exp((0.3 * random(12, 6)).cumsum(0))
     problem, bias, lever = pieces(start)
     result = problem.solve()
