@@ -18,7 +18,7 @@ from torchspline.calibrate.problem import (
     build,
 )
 from torchspline.calibrate.recording import Recording
-from torchspline.calibrate.start import Start, find_start
+from torchspline.calibrate.start import Start, find_start, with_known_offsets
 from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
 from torchspline.fit.losses import Huber, Loss
 from torchspline.fit.residual import Residual
@@ -195,7 +195,8 @@ def calibrate(
     measurement of its pose, see `ImageBlock`. Cost is linear in the length of the recording.
 
     Args:
-        start: where to begin; by default `find_start(recording)`.
+        start: where to begin; by default `find_start(recording)`, with time offsets that the recording knows where they
+            are not estimated.
         order, spacing [s]: of the trajectory's spline. Knots farther apart smooth what IMU readings say of fast motion.
         representation: "split" (R3 x SO3) or "joint" (SE3); results are the same.
         estimate: besides trajectory, extrinsics, gravity and biases: "time_offset" of every camera, "intrinsics" of
@@ -234,6 +235,8 @@ def calibrate(
     seconds = {}
     if start is None:
         start = find_start(recording)
+        if "time_offset" not in options.estimate:
+            start = with_known_offsets(start, recording)
     else:
         _check_start(start, recording)
     seconds["start"] = perf_counter() - begin

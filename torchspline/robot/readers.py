@@ -45,6 +45,8 @@ class Move(NamedTuple):
     screw: Array
     factor: float = 1.0
     offset: float = 0.0
+    #: The joint that stands here, where it mimics that one: its limits are of what it does itself.
+    mimic: Joint | None = None
 
 
 class Frame(NamedTuple):
@@ -154,7 +156,8 @@ def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
             driver, factor, offset = sources[joint.name]
             if driver == joint.name:
                 joints.append(own)
-            move = (Move(driver, _urdf_screw(joint), factor, offset),)
+            mimic = own if driver != joint.name else None
+            move = (Move(driver, _urdf_screw(joint), factor, offset, mimic),)
         pose = _origin(joint.origin)
         if not np.isfinite(pose).all():
             raise ValueError(
