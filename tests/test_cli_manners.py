@@ -132,6 +132,7 @@ def test_exit_statuses_are_the_same_and_said_everywhere():
         (("fit", "{poses}", "--start", "1e300"), "start: expected seconds, zero or more, got 1e+300"),
         (("fit", "{poses}", "--duration=-1e300"), "duration: expected seconds above zero"),
         (("fit", "{poses}", "--gap", "0"), "gap: expected milliseconds above zero"),
+        (("kernels", "show", "SO3", "--order", "99999999999"), "order: expected at most 20"),
         (("imu", "{poses}", "--margin", "1e300"), "margin: expected seconds, zero or more"),
         (
             ("demo", "--duration", "1e18", "--out", "{out}"),

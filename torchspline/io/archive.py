@@ -66,6 +66,8 @@ def read_bytes(path: Path) -> bytes:
         content = path.read_bytes()
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
+    except OSError as reason:
+        raise OSError(reason.errno, reason.strerror, str(path)) from None  # which reading alone does not say
     if not content.startswith(b"\x1f\x8b"):
         return content
     most = allowed_size(len(content))
