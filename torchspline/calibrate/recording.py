@@ -178,7 +178,7 @@ class Recording:
             raise ValueError(f"end: expected a time after start = {start:g} s, got {end:g}")
         low, high = self.start_ns + round(start * SECOND), self.start_ns + round(end * SECOND)
         corners = tuple(c.select((c.t_ns >= low) & (c.t_ns <= high)) for c in self.corners)
-        known = [round(x * _NS) for x in self.time_offset or () if x is not None] or [0]
+        known = [round(x * SECOND) for x in self.time_offset or () if x is not None] or [0]
         imus = tuple(x.window(low + min(known), high + max(known)) for x in self.imus)
         return replace(self, corners=corners, imus=imus)
 

@@ -282,7 +282,7 @@ def _aligned(
     imu = _thinned(recording.imus[j], recording.corners[i])
     # IMUs share a clock more likely than not: what is known of the first is where the search begins for all.
     known = (recording.time_offset and recording.time_offset[i]) or 0.0
-    imu = replace(imu, time_ns=imu.time_ns - round(known * _NS))
+    imu = replace(imu, time_ns=imu.time_ns - round(known * SECOND))
     length = float(imu.accelerometer.norm(dim=1).median()) if len(imu) else recording.gravity
     if not _AROUND_GRAVITY[0] <= length / recording.gravity <= _AROUND_GRAVITY[1]:
         raise ValueError(
