@@ -7,6 +7,7 @@ IMU's clock. The result is compared with the poses that were left out.
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,6 +55,9 @@ def fit(
     clock = Clock(
         Variable("time_offset", zero[:1]), Variable("clock_skew", zero[:1]), mid=int(low + high) // 2
     )
+    # The filters of the two sensors differ: one clock for both would be wrong by a millisecond for one of them.
+    late = torch.ones(len(t), dtype=torch.float64)
+    accel_clock = replace(clock, delay=Variable("accel_delay", zero[:1]), late=late)
     gravity = Variable("gravity", torch.tensor(STANDARD_GRAVITY, dtype=torch.float64), sphere=True)
     biases: dict[str, Variable | BSpline] = {
         name: Variable(name, zero) if bias_spacing == 0.0 else _bias(low, high, bias_spacing)
@@ -74,7 +78,7 @@ def fit(
     )
     problem.add(
         RESIDUALS["Accelerometer"](
-            t, samples.accelerometer[inside], sigma=SIGMAS[3], loss=Huber(3.0), clock=clock,
+            t, samples.accelerometer[inside], sigma=SIGMAS[3], loss=Huber(3.0), clock=accel_clock,
             bias=biases["accel_bias"], gravity=gravity,
         )
     )  # fmt: skip
@@ -173,6 +177,7 @@ def experiment(
                     f"{position.max() * 1e3:.1f} / {math.degrees(angle.max()):.2f}",
                     f"{fitted.variables['time_offset'].item() * 1e3:+.2f}",
                     f"{fitted.variables['clock_skew'].item() * 1e6:+.1f}",
+                    f"{fitted.variables['accel_delay'].item() * 1e3:+.2f}",
                     fitted.iterations,
                     f"{fitted.seconds:.1f}",
                 )
@@ -192,7 +197,8 @@ def experiment(
                 "seconds": fitted.seconds,
             }
     header = ["trajectory", "bias", "before: position [mm] / rotation [deg]", "RMS [mm] / [deg]",
-              "largest [mm] / [deg]", "offset [ms]", "skew [1e-6]", "iterations", "time [s]"]  # fmt: skip
+              "largest [mm] / [deg]", "offset [ms]", "skew [1e-6]",
+              "accelerometer later by [ms]", "iterations", "time [s]"]  # fmt: skip
     title = f"{record.name}: {len(withheld)} withheld poses from {len(chosen)} at {rate:g} Hz and the IMU"
     show(out, [Table(title, header, rows)])
     save(_figure((stamps[withheld] - stamps[0]) / SECOND, drawn, title), out / "inertial_fit.png")
