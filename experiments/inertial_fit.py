@@ -1,8 +1,8 @@
 """A trajectory from inertial readings and sparse poses: what motion capture saw in between is withheld and recovered.
 
 Poses thinned to a few a second hold the trajectory in place; gyroscope and accelerometer, at their full rate, say how
-it moves in between. Unknown besides the control points: biases, the direction of gravity, the offset and rate of the
-IMU's clock. The result is compared with the poses that were left out.
+it moves in between. Unknown besides the control points: biases, the direction of gravity, the mounting, the offset and
+rate of the IMU's clock and the delay between its sensors. The result is compared with the poses that were left out.
 """
 
 import math
@@ -59,6 +59,9 @@ def fit(
     late = torch.ones(len(t), dtype=torch.float64)
     accel_clock = replace(clock, delay=Variable("accel_delay", zero[:1]), late=late)
     gravity = Variable("gravity", torch.tensor(STANDARD_GRAVITY, dtype=torch.float64), sphere=True)
+    # Poses are said to be the IMU's own; how well that is calibrated shows here.
+    rotation = Variable("rotation", SO3.identity(), group=SO3)
+    lever_arm = Variable("lever_arm", zero)
     biases: dict[str, Variable | BSpline] = {
         name: Variable(name, zero) if bias_spacing == 0.0 else _bias(low, high, bias_spacing)
         for name in ("gyro_bias", "accel_bias")
@@ -74,12 +77,13 @@ def fit(
             loss=Huber(3.0),
             clock=clock,
             bias=biases["gyro_bias"],
+            rotation=rotation,
         )
     )
     problem.add(
         RESIDUALS["Accelerometer"](
             t, samples.accelerometer[inside], sigma=SIGMAS[3], loss=Huber(3.0), clock=accel_clock,
-            bias=biases["accel_bias"], gravity=gravity,
+            bias=biases["accel_bias"], gravity=gravity, rotation=rotation, lever_arm=lever_arm,
         )
     )  # fmt: skip
     result = problem.solve(cost_tolerance=1e-7)
