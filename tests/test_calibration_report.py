@@ -24,6 +24,7 @@ from torchspline.cli.calibrate import rows
 from torchspline.fit import Result
 from torchspline.io import ImuRecord, read_camchain, write_imu
 
+pytestmark = pytest.mark.usefixtures("compiled")
 SPACING = 0.05
 FILES = ("result.json", "camchain-imucam.yaml", "report.html")
 
