@@ -163,9 +163,7 @@ def test_real_recordings(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """No worse than 1.1 times a SciPy least-squares spline of the same order and spacing on the same window."""
-    monkeypatch.setenv(
-        "TORCHSPLINE_KERNELS", "auto"
-    )  # as for users; the reference takes several times as long
+    monkeypatch.setenv("TORCHSPLINE_KERNELS", "auto")  # as for users, and several times as fast
     done = torchspline(
         "imu", shared_data / poses, "--recorded", shared_data / recorded, "--rate", "200", "--duration", "60",
         "--spacing", spacing, "--out", tmp_path,
