@@ -15,6 +15,7 @@ from torchspline.imu import ImuNoise, measure
 from torchspline.io import ImuRecord
 from torchspline.kernels.mode import use_kernels
 
+pytestmark = pytest.mark.usefixtures("compiled")
 F64 = torch.float64
 SHORT = {"seconds": 6.0, "images": 60, "samples": 1200, "spacing": 0.05}
 
