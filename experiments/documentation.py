@@ -53,7 +53,9 @@ def experiment(out: Path, pages: list[str], publish: bool, seed: int) -> dict[st
         try:
             from pages import notebooks
         except ModuleNotFoundError as error:
-            raise SystemExit(f"pages: stories need {error.name}: pip install -c constraints.txt -e '.[docs]'") from None
+            raise SystemExit(
+                f"pages: stories need {error.name}: pip install -c constraints.txt -e '.[docs]'"
+            ) from None
         written = [notebooks.write(page, out) for page in stories]
     if publish:
         for path in drawn:

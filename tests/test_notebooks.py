@@ -66,7 +66,8 @@ def test_a_notebook_runs(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "# A page\n\nText.\n\n```python\nfrom matplotlib.figure import Figure\n\nx = 2\nprint(x + 1)\n```\n"
-        '```text\n3\n```\n\n```python\nfigure = Figure()\naxes = figure.subplots()\nfigure.savefig("figures/x.png")\n```\n\n![x](x.png)\n',
+        "```text\n3\n```\n\n```python\nfigure = Figure()\naxes = figure.subplots()\n"
+        'figure.savefig("figures/x.png")\n```\n\n![x](x.png)\n',
         encoding="utf-8",
     )
     text = page.read_text(encoding="utf-8")
