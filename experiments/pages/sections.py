@@ -19,7 +19,7 @@ _TOGETHER = re.compile(r"^( {4})(\w+), (\w+(?:, \w+)*): ([^\n]*(?:\n {5,}[^\n]*|
 _ERRORS = re.compile(r"^Raises:\n((?:[ \t]+[^\n]*\n?|\n)+)", re.M)
 _GOES_ON = re.compile(r"^    (?=\S)(?!\w+(?:, \w+)*:)", re.M)
 #: Where another parameter or error begins on the same line.
-_NEXT_ARGUMENT = re.compile(r"(?<=[.;]) (?=[a-z]\w*: )")
+_NEXT_ARGUMENT = re.compile(r"(?<=[.;]) (?=(?:[a-z]\w*|T_\w+): )")
 _NEXT_ERROR = re.compile(r"(?<=\.) (?=\w+Error: )")
 
 
