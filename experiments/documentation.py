@@ -39,7 +39,7 @@ def experiment(out: Path, pages: list[str], publish: bool, seed: int) -> dict[st
     rows: list[list[Any]] = []
     for name in names:
         (out / "figures").mkdir(exist_ok=True)
-        with _inside(out):
+        with _inside(out / "figures"):
             for block, printed, _ in run_page(DOCS / name):
                 shown = block.output is not None
                 same = same_output(printed, block.output or "") if shown else "-"

@@ -67,7 +67,7 @@ def test_a_notebook_runs(tmp_path):
     page.write_text(
         "# A page\n\nText.\n\n```python\nfrom matplotlib.figure import Figure\n\nx = 2\nprint(x + 1)\n```\n"
         "```text\n3\n```\n\n```python\nfigure = Figure()\naxes = figure.subplots()\n"
-        'figure.savefig("figures/x.png")\n```\n\n![x](x.png)\n',
+        'figure.savefig("x.png")\n```\n\n![x](x.png)\n',
         encoding="utf-8",
     )
     text = page.read_text(encoding="utf-8")
@@ -77,7 +77,7 @@ def test_a_notebook_runs(tmp_path):
     code = [x for x in ran.cells if x.cell_type == "code"]
     assert notebooks.printed(code[1]) == "3\n"
     assert any("image/png" in x.get("data", {}) for x in code[2].outputs)
-    assert not (tmp_path / "figures").exists()
+    assert not (tmp_path / "x.png").exists()
     assert "![" not in "".join(x.source for x in ran.cells)
 
 
