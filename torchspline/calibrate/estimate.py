@@ -195,8 +195,7 @@ def calibrate(
 
     Args:
         start: where to begin; by default `find_start(recording)`.
-        order, spacing: of the trajectory's spline, and of its knots, s. Knots farther apart smooth what IMU readings
-            say of fast motion.
+        order, spacing [s]: of the trajectory's spline. Knots farther apart smooth what IMU readings say of fast motion.
         representation: "split" (R3 x SO3) or "joint" (SE3); results are the same.
         estimate: besides trajectory, extrinsics, gravity and biases: "time_offset" of every camera, "intrinsics" of
             every camera, "line_delay" of rolling shutters (slower: corners of an image are no block then),
