@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
-from recordings.load import SECOND, Recording, load, usable
+from recordings.load import Recording, load, usable
 from torch import Tensor
 
 from torchspline import R3, SE3, SO3, BSpline, SplitBSpline, fit_poses
@@ -23,6 +23,7 @@ from torchspline.fit.residual import Clock
 from torchspline.fit.residuals import RESIDUALS
 from torchspline.fit.variables import Variable
 from torchspline.imu import STANDARD_GRAVITY
+from torchspline.units import SECOND
 
 ORDER = 6
 #: What a residual of one weighs: position [m], rotation [rad], gyroscope [rad/s], accelerometer [m/s^2].

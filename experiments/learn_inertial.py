@@ -11,7 +11,6 @@ they were looked at while motions, sensors and the network were chosen.
 """
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -66,9 +65,10 @@ def denoising(model: Calibrator, training: Training, seed: int) -> tuple[float, 
     batch = next(batches(training._replace(steps=1), seed, 1))
     with torch.no_grad():
         smooth = model.denoised(batch["gyroscope"])
-    return tuple(
+    before, after = (
         rms((x - batch["angular_velocity"]).diff(dim=1)) / 2**0.5 for x in (batch["gyroscope"], smooth)
-    )  # type: ignore[return-value]
+    )
+    return before, after
 
 
 def processes_agree(training: Training, steps: int, seed: int) -> tuple[list[float], list[float], float]:
@@ -131,12 +131,12 @@ def experiment(
     for name in recordings:
         recording = load(ROOT / data, name, seed=0)
         raw = recording.samples.gyroscope
-        simple: dict[str, Callable[[], Tensor]] = {
-            "none": lambda raw=raw: raw,
-            "stillest second": lambda r=recording, raw=raw: raw - stillest(r),
-            "least squares alone": lambda r=recording: corrected(r, calibrate(untrained, r, lengths)),
+        simple = {
+            "none": raw,
+            "stillest second": raw - stillest(recording),
+            "least squares alone": corrected(recording, calibrate(untrained, recording, lengths)),
         }
-        errors[name] = {method: [orientation_errors(recording, make())] for method, make in simple.items()}
+        errors[name] = {method: [orientation_errors(recording, x)] for method, x in simple.items()}
         calibrations = [calibrate(model, recording, lengths) for model, _ in trained]
         for method, only_bias, denoise in (
             ("network", False, False), ("network, bias only", True, False), ("network, denoised", False, True),

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import torch
 from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
-from recordings.load import SECOND, YARDSTICK, Recording, load, longest_stretch, near_gaps
+from recordings.load import YARDSTICK, Recording, load, longest_stretch, near_gaps
 
 from torchspline import BSpline, fit_poses
-from torchspline.fit.align import Alignment, align_imu
+from torchspline.fit import Alignment, align_imu
 from torchspline.imu import measure
+from torchspline.units import SECOND
 
 SPACINGS = (20, 40, 80, 160)
 #: Left out at both ends of a window, and its length at most.

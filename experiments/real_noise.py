@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
-from recordings.load import SECOND, Recording, load, longest_stretch
+from recordings.load import Recording, load, longest_stretch
 from scipy.signal import welch
 from torch import Tensor
 
@@ -33,6 +33,7 @@ from torchspline.imu import (
 from torchspline.imu.noise import flicker_noise
 from torchspline.io import ImuRecord, PoseRecord
 from torchspline.plot import allan_panel
+from torchspline.units import SECOND
 
 SENSORS = ("gyroscope", "accelerometer")
 UNITS = {"gyroscope": "rad/s", "accelerometer": "m/s²"}

@@ -8,8 +8,9 @@ found from their readings.
 
 import gzip
 import time
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from common import ROOT, Table, run, save, show
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchspline import SE3, SO3, BSpline, Rn, fit, imu, use_kernels
+from torchspline import SE3, SO3, BSpline, Rn, Trajectory, fit, imu, use_kernels
 from torchspline.robot import JointFit, Robot, fit_joints
 
 DOUBLE = torch.float64
@@ -56,6 +57,12 @@ def end_of(robot: Robot) -> str:
 # ---------------------------------------------------------------------- links
 
 
+def velocity_of(trajectory: Trajectory, t: Tensor) -> Tensor:
+    state = trajectory.evaluate(t, derivatives=1)
+    assert state.velocity is not None
+    return state.velocity
+
+
 def differences(robot: Robot, samples: int, seed: int) -> dict[str, float]:
     """Largest errors of twist and acceleration over links and times, as shares of the largest values."""
     spline = BSpline(normal(24, robot.dof, seed=seed), group=Rn(robot.dof), order=6, dt=0.4, learnable=False)
@@ -67,6 +74,7 @@ def differences(robot: Robot, samples: int, seed: int) -> dict[str, float]:
     around = links(t[:, None] + h * torch.arange(-3, 4, dtype=DOUBLE))  # (L, N, 7, 7)
     first, second = torch.tensor(FIRST, dtype=DOUBLE) / h, torch.tensor(SECOND, dtype=DOUBLE) / h**2
     motion = links.kinematics(t)
+    assert motion.rotation is not None
     # Rotations near the middle one, as vectors: their first derivative is w, their second its derivative.
     turns = SO3.log(SO3.between(motion.rotation.unsqueeze(-2), around[..., 3:]))
     pairs = {
@@ -75,14 +83,11 @@ def differences(robot: Robot, samples: int, seed: int) -> dict[str, float]:
         "acceleration": (motion.acceleration, torch.einsum("k,lnkc->lnc", second, around[..., :3])),
         "angular acceleration": (motion.angular_acceleration, torch.einsum("k,lnkc->lnc", second, turns)),
     }
-    found = {name: float((x - y).abs().max() / y.abs().max()) for name, (x, y) in pairs.items()}
-
-    def rate(t: Tensor) -> Tensor:
-        state = links.evaluate(t, derivatives=1)
-        assert state.velocity is not None
-        return state.velocity
-
-    forward = torch.func.jvp(rate, (t,), (torch.ones_like(t),))[1]
+    found = {}
+    for name, (x, y) in pairs.items():
+        assert x is not None
+        found[name] = float((x - y).abs().max() / y.abs().max())
+    forward = torch.func.jvp(partial(velocity_of, links), (t,), (torch.ones_like(t),))[1]
     exact = links.evaluate(t).acceleration
     assert exact is not None
     found["acceleration, forward mode"] = float((exact - forward).abs().max() / forward.abs().max())
@@ -104,7 +109,10 @@ def gradients(robot: Robot, seed: int) -> float:
     steps = h * torch.eye(len(flat), dtype=DOUBLE)
     with torch.no_grad():
         moved = [
-            sum(c * loss((flat + (i - 3) * step).view_as(points)) for i, c in enumerate(FIRST) if c) / h
+            torch.stack(
+                [c * loss((flat + (i - 3) * step).view_as(points)) for i, c in enumerate(FIRST) if c]
+            ).sum()
+            / h
             for step in steps
         ]
     return float((gradient.flatten() - torch.stack(moved)).abs().max() / gradient.abs().max())
@@ -184,10 +192,12 @@ def noise_of(t: Tensor, x: Tensor, count: int = 9) -> Tensor:
 
 def delay_of(fitted: JointFit, j: int, t: Tensor, q: Tensor, rate: Tensor) -> tuple[float, float]:
     """How late the recorded velocity of a joint is, s, and its standard deviation, as an unknown of `fit.Problem`."""
-    spline, sigmas = fitted.trajectory, (fitted.position_sigma[j], fitted.velocity_sigma[j])  # type: ignore[index]
+    spline = fitted.trajectory
+    assert fitted.velocity_sigma is not None
+    sigmas = fitted.position_sigma[j], fitted.velocity_sigma[j]
     one = BSpline(
         spline.control_points.detach()[:, j : j + 1],
-        group=Rn(1), order=spline.order, dt=float(spline.dt), t0=float(spline.t0),
+        group=Rn(1), order=spline.order, dt=fitted.spacing, t0=spline.domain[0],
     )  # fmt: skip
     delay = fit.Variable("delay", torch.zeros(1, dtype=DOUBLE))
     problem = fit.Problem(one)
@@ -202,19 +212,21 @@ def delay_of(fitted: JointFit, j: int, t: Tensor, q: Tensor, rate: Tensor) -> tu
 
 
 def recorded(
-    robot: Robot, t: Tensor, q: Tensor, rate: Tensor, spacing: float | str
+    robot: Robot, t: Tensor, q: Tensor, rate: Tensor, spacing: float | Literal["auto"]
 ) -> tuple[JointFit, dict[str, Any]]:
     since = time.perf_counter()
-    fitted = fit_joints(t, q, rate, dt=spacing, estimate_delay=True)  # type: ignore[arg-type]
+    fitted = fit_joints(t, q, rate, dt=spacing, estimate_delay=True)
     seconds = time.perf_counter() - since
     assert fitted.velocity_residual is not None
     assert fitted.velocity_sigma is not None
     assert fitted.velocity_delay is not None
-    sigmas = {"position_sigma": fitted.position_sigma, "velocity_sigma": fitted.velocity_sigma}
-    at_once = fit_joints(t, q, rate, dt=fitted.spacing, **sigmas)
+    at_once = fit_joints(
+        t, q, rate, dt=fitted.spacing,
+        position_sigma=fitted.position_sigma, velocity_sigma=fitted.velocity_sigma,
+    )  # fmt: skip
     assert at_once.velocity_residual is not None
     alone = fit_joints(t, q, dt=fitted.spacing, position_sigma=fitted.position_sigma)
-    derived = alone.trajectory.evaluate(t, derivatives=1).velocity.detach()  # type: ignore[union-attr]
+    derived = velocity_of(alone.trajectory, t).detach()
     rows, local = {}, noise_of(t, rate)
     for j, joint in enumerate(robot.joints):
         late, sure = delay_of(fitted, j, t, q, rate)
@@ -250,7 +262,7 @@ def from_imus(
     A joint about the vertical turns nothing that an IMU at rest sees; the readings say where it starts.
     """
     full = fitted.trajectory
-    dt, (start, end) = float(full.dt), full.domain
+    dt, (start, end) = fitted.spacing, full.domain
     first = max(int((window[0] - start) / dt), 0)
     last = min(int((window[1] - start) / dt), round((end - start) / dt))
     points = full.control_points.detach()[first : last + full.order - 1]
@@ -259,9 +271,10 @@ def from_imus(
     t = torch.arange(truth.domain[0], truth.domain[1], 1.0 / rate, dtype=DOUBLE)
     spline = BSpline(points + disturbance * normal(*points.shape, seed=seed), **options)
     problem = fit.Problem(spline)
+    kinds: list[type[fit.Gyroscope] | type[fit.Accelerometer]] = [fit.Gyroscope, fit.Accelerometer]
     for i, link in enumerate(links):
         reading = imu.measure(robot.link(truth, link), t)
-        for k, (kind, ideal) in enumerate(zip((fit.Gyroscope, fit.Accelerometer), reading, strict=True)):
+        for k, (kind, ideal) in enumerate(zip(kinds, reading, strict=True)):
             made = ideal + noise[k] * normal(*ideal.shape, seed=seed + 1 + 2 * i + k)
             problem.add(robot.residual(link, kind, t, made, sigma=noise[k]))
     problem.add(fit.StateValue(t[:3], truth(t[:3]), sigma=1e-4))
@@ -301,7 +314,9 @@ def draw(
     axes = figure.subplots(2, 2)
     shown = (t - t[0] > 0.45 * (t[-1] - t[0])) & (t - t[0] < 0.55 * (t[-1] - t[0]))
     dense = torch.linspace(float(t[shown][0]), float(t[shown][-1]), 800, dtype=DOUBLE)
-    velocity = fitted.trajectory.evaluate(dense, derivatives=1).velocity.detach()
+    velocity = velocity_of(fitted.trajectory, dense).detach()
+    assert fitted.velocity_residual is not None
+    assert fitted.velocity_sigma is not None
     for j, name in enumerate(robot.joint_names):
         axes[0, 0].plot(t[shown], rate[shown, j], ".", color=f"C{j}", alpha=0.4)
         axes[0, 0].plot(dense, velocity[:, j], color=f"C{j}", label=name)
@@ -325,7 +340,8 @@ def draw(
 
 
 def experiment(
-    out: Path, data: str, robots: list[str], samples: int, log: str, log_robot: str, spacing: float | str,
+    out: Path, data: str, robots: list[str], samples: int, log: str, log_robot: str,
+    spacing: float | Literal["auto"],
     links: list[str], window: tuple[float, float], rate: float, noise: tuple[float, float],
     disturbance: float, seed: int,
 ) -> dict[str, Any]:  # fmt: skip

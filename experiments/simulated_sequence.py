@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from simulated.baseline import baseline
 from simulated.sequences import Sequence, make_sequence, read_sequence
 
-from torchspline.fit.problem import Linearizer
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.terms import Term
 
 #: Milliseconds of the C++ stack, (analytic, automatic) Jacobians, from the README of the recordings.
 ESTABLISHED: dict[tuple[str, int, str], tuple[float | None, float]] = {

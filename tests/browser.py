@@ -30,7 +30,7 @@ _OPTIONS = (
 class Browser:
     """One window on one page; a context manager."""
 
-    def __init__(self, patience: float = 60.0):
+    def __init__(self, patience: float = 180.0):
         assert PROGRAM
         self.patience, self._count, self._rest = patience, 0, b""
         self._folder = tempfile.TemporaryDirectory(prefix="torchspline-browser-", ignore_cleanup_errors=True)

@@ -1,33 +1,20 @@
 """What the functions of the package accept, and what every argument of a kind is tried with."""
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
-from unittest import mock
 
 import torch
-from scipy.spatial.transform import Rotation
 
-import torchspline
 import torchspline.io as records
 from torchspline import (
-    R3,
     SE3,
     SO3,
-    Alignment,
-    BSpline,
     HermiteSpline,
-    KeyframeSpline,
-    NonuniformBSpline,
-    Rn,
     SplitBSpline,
-    imu,
 )
 from torchspline.groups import convert
-from torchspline.splines.trajectory import Mounted
 
 F32, F64, I64 = torch.float32, torch.float64, torch.int64
 NAN, INF = float("nan"), float("inf")
@@ -71,142 +58,19 @@ POSE_COLUMNS = {"time_ns": torch.arange(8), "position": V[0], "rotation": Q[0]}
 IMU_COLUMNS = {"time_ns": torch.arange(8), "gyroscope": V[0], "accelerometer": V[0]}
 POSES, SAMPLES = records.PoseRecord(**POSE_COLUMNS), records.ImuRecord(**IMU_COLUMNS)
 
-#: As much of PyPose as the conversions look at, so that their errors are tried without it.
-PYPOSE = SimpleNamespace(
-    LieTensor=type("LieTensor", (), {"ltype": "SE3", "tensor": lambda self: POSE}),
-    SO3_type="SO3",
-    SE3_type="SE3",
-    SO3=torch.clone,
-    SE3=torch.clone,
-)
-
-
-def with_pypose(function: Callable[..., Any]) -> Callable[..., Any]:
-    return mock.patch.dict(sys.modules, {"pypose": PYPOSE})(function)
-
-
-def enter_use_kernels(mode: str) -> None:
-    with torchspline.use_kernels(mode):
-        pass
-
-
-#: A motion, what a gyroscope reads on it, and how the two are aligned.
-TURNING = BSpline(
-    SO3.exp(torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=F64)),
-    group=SO3, dt=1.0, learnable=False,
-)  # fmt: skip
-READ_AT = torch.linspace(0.0, 9.0, 90, dtype=F64)
-with torch.no_grad():
-    GYRO = TURNING.kinematics(READ_AT).angular_velocity
-ALIGNED = Alignment(0.0, 0.0, 4.5, Q[0, 0], None, V[0, 0], None, None, 0.0, None, {}, (90, 0))
-
-
-def align_quickly(**arguments: Any) -> Alignment:
-    """With compiled loops, so that calls that are accepted take no time to speak of."""
-    with torchspline.use_kernels("auto"):
-        return torchspline.align_imu(**arguments)
-
+# ---------------------------------------------------------------------- functions and good arguments
 
 #: Every public function, called by keyword with arguments it accepts.
-ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
-    "Group": (torchspline.Group, {"name": "SO3"}),
-    "Rn": (Rn, {"size": 2}),
-    "use_kernels": (enter_use_kernels, {"mode": "auto"}),
-    "product": (lambda groups: torchspline.product(*groups), {"groups": (R3, SO3)}),
-    "Group.identity": (lambda batch, **k: SE3.identity(*batch, **k), {"batch": (2,), "dtype": F64}),
-    "Group.random": (
-        lambda batch, **k: SE3.random(*batch, **k),
-        {"batch": (2,), "generator": None, "dtype": F64},
-    ),
-    "Group.from_matrix": (SE3.from_matrix, {"matrix": SE3_MATRIX}),
-    **{
-        f"Group.{name}": (getattr(SE3, name), {"tangent": TANGENT})
-        for name in ("exp", "left_jacobian", "left_jacobian_inverse", "right_jacobian", "right_jacobian_inverse")
-    },
-    **{
-        f"Group.{name}": (getattr(SE3, name), {"point": POSE})
-        for name in ("adjoint", "inverse", "log", "normalize", "to_matrix")
-    },
-    "Group.compose": (SE3.compose, {"left": POSE, "right": POSE}),
-    "Group.between": (SE3.between, {"start": POSE, "end": POSE}),
-    "Group.act": (SE3.act, {"point": POSE, "vector": V}),
-    "Group.adjoint_act": (SE3.adjoint_act, {"point": POSE, "tangent": TANGENT}),
-    "Group.bracket": (SE3.bracket, {"a": TANGENT, "b": TANGENT}),
-    "Group.retract": (SE3.retract, {"point": POSE, "tangent": TANGENT, "side": "left"}),
-    "Group.power": (SE3.power, {"point": POSE, "exponent": TANGENT[..., 0]}),
-    "pose_to_dual_quaternion": (convert.pose_to_dual_quaternion, {"pose": POSE}),
-    "pose_from_dual_quaternion": (convert.pose_from_dual_quaternion, {"Q": DUAL}),
-    "to_screw": (convert.to_screw, {"Q": DUAL}),
-    "from_screw": (convert.from_screw, convert.to_screw(DUAL)._asdict()),
-    "Group.interpolate": (SE3.interpolate, {"start": POSE, "end": POSE, "s": TANGENT[..., 0]}),
-    "to_xyzw": (convert.to_xyzw, {"q": Q}),
-    "from_xyzw": (convert.from_xyzw, {"q": Q}),
-    "pose_to_xyzw": (convert.pose_to_xyzw, {"pose": POSE}),
-    "pose_from_xyzw": (convert.pose_from_xyzw, {"pose": POSE}),
-    "to_rotation_matrix": (convert.to_rotation_matrix, {"q": Q}),
-    "from_rotation_matrix": (convert.from_rotation_matrix, {"matrix": SO3_MATRIX}),
-    "to_rotation_vector": (convert.to_rotation_vector, {"q": Q}),
-    "from_rotation_vector": (convert.from_rotation_vector, {"vector": V}),
-    "to_transform_matrix": (convert.to_transform_matrix, {"pose": POSE}),
-    "from_transform_matrix": (convert.from_transform_matrix, {"matrix": SE3_MATRIX}),
-    "from_euler": (convert.from_euler, {"angles": V, "sequence": "XYZ"}),
-    "to_euler": (convert.to_euler, {"q": Q, "sequence": "xyz"}),
-    "to_scipy": (convert.to_scipy, {"q": Q[0]}),
-    "from_scipy": (convert.from_scipy, {"rotation": Rotation.identity(2), "dtype": F64}),
-    "to_pypose": (with_pypose(convert.to_pypose), {"x": POSE, "kind": "SE3"}),
-    "from_pypose": (with_pypose(convert.from_pypose), {"lietensor": PYPOSE.LieTensor()}),
-    "to_transform3d": (convert.to_transform3d, {"pose": POSE[0]}),
-    "from_transform3d": (convert.from_transform3d, {"transform": convert.to_transform3d(POSE[0])}),
-    "bspline": (torchspline.functional.bspline, {"control_points": POSE, "t": T, "group": SE3, "dt": 0.1}),
-    "BSpline": (BSpline, {"control_points": POSE, "group": SE3, "dt": 0.1}),
-    "SplitBSpline": (SplitBSpline, {"control_points": POSE, "dt": 0.1}),
-    "BSpline.evaluate": (SPLINE.evaluate, {"t": T, "derivatives": 2}),
-    "BSpline.jacobians": (SPLINE.jacobians, {"t": T, "derivatives": 2, "side": "left"}),
-    "Trajectory.forward": (SPLINE.forward, {"t": T}),
-    "Trajectory.kinematics": (SPLINE.kinematics, {"t": T}),
-    "Trajectory.mounted": (SPLINE.mounted, {"T_body_sensor": POSE[0, 0]}),
-    "Mounted": (Mounted, {"trajectory": SPLINE, "T_body_sensor": POSE[0, 0]}),
-    "Mounted.evaluate": (
-        lambda T_body_sensor, **k: Mounted(SPLINE, T_body_sensor).evaluate(**k),
-        {"T_body_sensor": POSE[0, 0], "t": T, "derivatives": 2},
-    ),
-    "measure": (imu.measure, {"trajectory": SPLINE, "t": T}),
-    "geodesic_product": (
-        torchspline.functional.geodesic_product,
-        {"start": POSE, "steps": TANGENT[..., None, :], "weights": TANGENT[..., :2, None], "group": SE3},
-    ),
-    "hermite": (torchspline.functional.hermite, {**KNOTS, "t": T, "coordinates": "product", "frame": "body"}),
-    "HermiteSpline": (HermiteSpline, {**KNOTS, "coordinates": "logarithm", "frame": "world"}),
-    "HermiteSpline.evaluate": (HERMITE.evaluate, {"t": T, "derivatives": 2, "frame": "world"}),
-    "HermiteSpline.differentials": (HERMITE.differentials, {"t": T, "side": "left"}),
-    "nonuniform_bspline": (torchspline.functional.nonuniform_bspline, {**KNOTTED, "t": T}),
-    "NonuniformBSpline": (NonuniformBSpline, KNOTTED),
-    "NonuniformBSpline.evaluate": (NonuniformBSpline(**KNOTTED).evaluate, {"t": T, "derivatives": 2}),
-    "NonuniformBSpline.insert_knot": (NonuniformBSpline(**KNOTTED).insert_knot, {"time": 0.25}),
-    "interpolate": (
-        torchspline.functional.interpolate,
-        {"method": "geodesic", **KEYED, "t": T, "group": SE3, "derivatives": 2},
-    ),
-    "KeyframeSpline": (KeyframeSpline, {"method": "geodesic", **KEYED, "group": SE3}),
-    "KeyframeSpline.evaluate": (KeyframeSpline("SE3Up", **KEYED).evaluate, {"t": T, "derivatives": 2}),
-    "consistent_signs": (torchspline.consistent_signs, {"points": POSE, "group": SE3}),
-    "phantom_points": (torchspline.phantom_points, {"keyframes": POSE, "group": SE3}),
-    "initial_control_points": (
-        torchspline.initial_control_points,
-        {"t": STAMPS, "poses": POSE[0], "group": SE3, "order": 4, "dt": 1.0, "t0": 0.0, "count": 5},
-    ),
-    "fit_poses": (torchspline.fit_poses, {"t": STAMPS, "poses": POSE[0], "dt": 2.0, "max_iterations": 1}),
-    "align_imu": (align_quickly, {"trajectory": TURNING, "t": READ_AT, "gyro": GYRO, "accel": None}),
-    "Alignment.pose_time": (ALIGNED.pose_time, {"t": READ_AT}),
-    "read_poses": (records.read_poses, {"path": TUM_FILE}),
-    "read_imu": (records.read_imu, {"path": IMU_FILE}),
-    "write_poses": (records.write_poses, {"path": f"{FOLDER.name}/poses.txt", "record": POSES}),
-    "write_imu": (records.write_imu, {"path": f"{FOLDER.name}/imu.csv", "record": SAMPLES}),
-    "PoseRecord": (records.PoseRecord, POSE_COLUMNS),
-    "ImuRecord": (records.ImuRecord, IMU_COLUMNS),
-    "_Record.seconds": (POSES.seconds, {}),
-    "_Record.window": (POSES.window, {"start_ns": 0, "end_ns": 3}),
-}  # fmt: skip
+ACCEPTED: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {}
+
+
+def accept(functions: dict[str, tuple[Callable[..., Any], dict[str, Any]]]) -> None:
+    """Enters functions, each with arguments it accepts; no two files may enter the same one."""
+    again = ACCEPTED.keys() & functions.keys()
+    if again:
+        raise ValueError(f"{sorted(again)} were entered by another file of cases")
+    ACCEPTED.update(functions)
+
 
 # ---------------------------------------------------------------------- arguments that are refused
 
@@ -364,3 +228,33 @@ def control_points(function: str, argument: str, good: torch.Tensor, least: int)
     yield from tensor(function, argument, " (..., M, 7), M points of", slice(3, 7), like=good)
     bad = good[..., : least - 1, :]
     yield refused(function, argument, "count", bad, f"got {least - 1}", f"at least {least} ")
+
+
+def pointwise(function: str) -> Iterator[Case]:
+    """What functions of points and tangents are tried with, one tensor after the other."""
+    quaternions = {"x": 3, "point": 3, "left": 3, "right": 3, "start": 3, "end": 3, "pose": 3, "q": 0, "Q": 0}
+    good = ACCEPTED[function][1]
+    together = [name for name, x in good.items() if isinstance(x, torch.Tensor)]
+    for name in together:
+        if name in ("s", "exponent", "matrix"):
+            continue  # of another shape, and tried by the callers
+        start = quaternions.get(name)
+        width = good[name].shape[-1]
+        part = None if start is None else slice(start, width)
+        if function == "pose_from_xyzw":
+            part = slice(3, 7)
+        if name == "Q":
+            part = slice(0, 4)
+        others = [other for other in together if other != name]
+        yield from tensor(function, name, f" (..., {width})", part, others[0] if others else None)
+        if others:
+            other, batch = others[0], good[name][:1].expand(3, *good[name].shape[1:])
+            yield refused(function, name, "batch", batch, f"{name} (3, 8)", f"{other} (2, 8)")
+
+
+def matrices(function: str, size: int) -> Iterator[Case]:
+    """What matrices of a group are tried with."""
+    good = ACCEPTED[function][1]["matrix"]
+    yield from tensor(function, "matrix", f" (..., {size}, {size})")
+    for bad in (-good, good.mT * 1.01):
+        yield refused(function, "matrix", "option", bad, "is off by", "expected matrices of the group")

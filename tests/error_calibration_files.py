@@ -4,12 +4,10 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import error_online  # noqa: F401  (its cases are made of all that is accepted before this module adds to it)
 import numpy as np
 import torch
 import yaml
 from error_arguments import (
-    ACCEPTED,
     F32,
     F64,
     FOLDER,
@@ -19,6 +17,7 @@ from error_arguments import (
     POSE,
     SAMPLES,
     Case,
+    accept,
     changed,
     file,
     numbers,
@@ -60,6 +59,7 @@ RECORDED = {
     "imus": (SAMPLES,),
     "noise": (NOISE,),
     "gravity": 9.8,
+    "time_offset": None,
 }
 RECORDING = Recording(**RECORDED)
 CHAIN = CamChain((CAMERA,), POSE[0, :1], torch.zeros(1, dtype=F64))
@@ -86,7 +86,7 @@ def write(folder: object, calibration: object) -> None:
     calibrate.write_calibration(folder, found() if calibration is FOUND else calibration)
 
 
-ACCEPTED.update(
+accept(
     {
         "Camera": (
             Camera,
@@ -257,6 +257,11 @@ def _of_recordings() -> Iterator[Case]:
     yield refused("Recording", "corners", "count", (), "got 0", "one for each of the 1 cameras")
     yield refused("Recording", "noise", "count", (NOISE, NOISE), "got 2", "one for each of the 1 imus")
     yield from numbers("Recording", "gravity", 0.0, -9.8)
+    for bad in (0.1, "0.1", torch.zeros(1)):
+        yield refused("Recording", "time_offset", "type", bad, f"got {type(bad).__name__}", "one a camera")
+    yield refused("Recording", "time_offset", "type", ("0",), "got str", "a number")
+    yield refused("Recording", "time_offset", "count", (0.0, 0.0), "got 2", "each of the 1 cameras")
+    yield refused("Recording", "time_offset", "nan", (NAN,), "got nan", "a finite number")
     aside = Corners(**{**COLUMNS, "uv": COLUMNS["uv"] + 600.0})
     yield refused("Recording", "corners", "option", (aside,), "got (700.0, 700.0)", "640 x 480")
     back = records.ImuRecord(SAMPLES.time_ns.flip(0), SAMPLES.gyroscope, SAMPLES.accelerometer)
@@ -299,8 +304,6 @@ def _of_recordings() -> Iterator[Case]:
     for bad in (NAN, INF, 0.0, -1.0):
         yield refused("find_start", "max_offset", "nan", bad, f"got {bad}", "above zero")
 
-
-CASES = list(cases())
 
 _FILES = "read_camchain write_camchain read_corners read_recording write_calibration"
 _CHECKED = "Recording board_poses find_start"

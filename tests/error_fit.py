@@ -1,4 +1,4 @@
-"""What least squares is tried with, and what its errors have to say; joins the tables of the other functions."""
+"""Bad arguments of least squares: residuals, losses, unknowns, problems and their results."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from error_arguments import (
-    ACCEPTED,
     F64,
     I64,
     INF,
@@ -16,6 +15,7 @@ from error_arguments import (
     Q,
     T,
     V,
+    accept,
     changed,
     groups,
     numbers,
@@ -27,7 +27,9 @@ from error_arguments import (
 from fit_cases import sample
 
 from torchspline import R3, SE3, SO3, BSpline, Rn, fit
+from torchspline.fit.losses import Loss
 from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.residuals.motion import MotionResidual
 
 SPLINE = BSpline(POSE[0], group=SE3, dt=0.1)
 TURNING = BSpline(Q[0], group=SO3, dt=0.1)
@@ -100,7 +102,7 @@ def solve(**k: Any) -> Any:
     return problem.solve(**k)
 
 
-FITTING: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{name: (bound(name), arguments(name)) for name in RESIDUALS},
     **{name: (getattr(fit, name), {"scale": 2.0}) for name in ("Huber", "Cauchy", "GemanMcClure")},
     "Variable": (fit.Variable, {"name": "pose", "value": POSE[0, 0], "group": SE3, "sphere": False}),
@@ -119,7 +121,62 @@ FITTING: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Problem.release": (with_point("release"), {"unknown": SPLINE}),
     "Problem.solve": (solve, {"max_iterations": 1}),
 }
-ACCEPTED |= FITTING
+accept(FUNCTIONS)
+
+_LOSSES = " ".join(loss.__name__ for loss in Loss.__subclasses__())
+_SOLVING = "Problem.add_prior Problem.freeze Problem.release Problem.solve Result.covariance Result.standard_deviation"
+_NUMBERS = f"{_LOSSES} Problem.release Problem.solve Result.covariance Result.standard_deviation"
+_WITHOUT_QUATERNIONS = " ".join(
+    name
+    for name, kind in RESIDUALS.items()
+    if name != "StateValue"
+    and not kind.measured_signs
+    and all(slot.group is None for slot in kind.slots.values())
+)
+
+#: What is made and handed out.
+RESULTS = {"Result"}
+UNTRIED = {
+    "Problem.prepare": "no arguments",
+    "Residual.bind": "tried through Problem.add, which calls it",
+    **{
+        getattr(kind, method).__qualname__: "called by the solver, on numbers that were checked"
+        for kinds, methods in (
+            (RESIDUALS.values(), ("evaluate", "reverse")),
+            (MotionResidual.__subclasses__(), ("error", "error_reverse")),
+            (Loss.__subclasses__(), ("rho", "weight")),
+            ((fit.Variable,), ("basis", "points", "retract")),
+        )
+        for kind in kinds
+        for method in methods
+    },
+}
+#: Where a kind of mistake cannot be made, as in test_errors.py.
+NOT_APPLICABLE: dict[str, dict[str, str]] = {
+    "shape": {"no tensor": _NUMBERS},
+    "dtype": {"no tensor": f"Problem {_NUMBERS}"},
+    "device": {
+        "measurements are copied to the CPU": f"{' '.join(RESIDUALS)} Variable Clock smoothness Problem.add",
+        "no tensor that stays": f"{_LOSSES} {_SOLVING}",
+    },
+    "nan": {
+        "checked when the residual was made": "Problem.add",
+        "no numbers that can be one": "Problem.freeze Problem.release Result.covariance Result.standard_deviation",
+    },
+    "zero quaternion": {
+        "no quaternion in it": f"{_WITHOUT_QUATERNIONS} {_LOSSES} Clock",
+        "checked when residual and trajectory were made": f"smoothness Problem.add {_SOLVING} "
+        "Result.trajectory_covariance",
+    },
+    "count": {
+        "any number of measurements, unknowns and control points": f"{_LOSSES} Variable Clock smoothness Problem "
+        f"Problem.add Result.trajectory_covariance {_SOLVING}",
+    },
+    "time": {
+        "no trajectory to lie on before Problem.add": f"{' '.join(RESIDUALS)} {_LOSSES} Variable Clock",
+        "times come with residuals": f"smoothness Problem {_SOLVING}",
+    },
+}
 
 
 def cases() -> Iterator[Case]:
@@ -239,6 +296,9 @@ def priors() -> Iterator[Case]:
 def covariances() -> Iterator[Case]:
     for function in ("Result.covariance", "Result.standard_deviation"):
         for bad in (None, "bias", SPLINE):
+            if bad is SPLINE and function.endswith("deviation"):
+                yield refused(function, "variable", "option", bad, "BSpline(SE3", "that were solved for")
+                continue
             yield refused(function, "variable", "type", bad, f"got {type(bad).__name__}", "fit.Variable")
         yield refused(
             function, "variable", "option", MAP, "map is not among", "unknowns that were solved for"
@@ -248,6 +308,11 @@ def covariances() -> Iterator[Case]:
     yield refused(function, "t", "shape", T[None], "got (1, 3)", "expected shape (N,)")
     for bad in (4, -1, True, 1.0, None):
         yield refused(function, "derivatives", "option", bad, f"got {bad!r}", "from 0 to 3")
+    yield refused(
+        function, "stretch", "option", 0.2, "got 0.2", "at most the knot spacing of the spline, 0.1 s"
+    )
+    for number in (0.0, -1.0, NAN):
+        yield refused(function, "stretch", "option", number, f"got {number}", "above zero")
 
 
 def variables() -> Iterator[Case]:
@@ -269,7 +334,7 @@ def clocks() -> Iterator[Case]:
             yield refused(
                 "Clock", name, "type", bad, f"got {type(bad).__name__}", "a torchspline.fit.Variable"
             )
-        for bad in (BIAS, fit.Variable("many", torch.zeros(4, 1))):
+        for bad in (BIAS, fit.Variable("many", torch.zeros(4, 2))):
             yield refused("Clock", name, "shape", bad, f"got Variable('{bad.name}'", "shape (1,)")
     for case in numbers("Clock", "mid"):
         if case.changes["mid"] is not None:
@@ -355,6 +420,13 @@ def problems() -> Iterator[Case]:
         TIMES, V[0], bias=fit.Variable("twin", torch.zeros(3)), scaling=fit.Variable("twin", torch.ones(9))
     )
     yield case("option", {"residual": batch}, "two called 'twin'", "one unknown of each name", "variable")
+    several = fit.Gyroscope(TIMES, V[0], bias=BSpline(V[:2], group=R3, dt=0.5))
+    yield case(
+        "shape", {"residual": several}, "got control points of shape (2, 8, 3)", "without a batch", "spline"
+    )
+    clock = fit.Clock(offset=fit.Variable("late", torch.zeros(2, 1)))
+    several = fit.Gyroscope(TIMES, V[0], clock=clock)
+    yield case("shape", {"residual": several}, "got Variable('late'", "for BatchProblem", "clock")
     states = fit.StateVelocity(TIMES, V[0])
     yield case("shape", {"residual": states}, "got (8, 3)", "expected shape (8, 6)", "measured")
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from error_arguments import ACCEPTED, FOLDER, INF, NAN, Case, refused, wholes
+from error_arguments import FOLDER, INF, NAN, Case, accept, refused, wholes
 
 from torchspline import generate
 
@@ -17,7 +17,7 @@ def _motion(parameters: dict[str, Any], **arguments: Any) -> Any:
     return generate.random_motion(**arguments, **parameters)
 
 
-ACCEPTED.update(
+accept(
     {
         "random_motion": (
             _motion,
@@ -121,6 +121,3 @@ def recipes() -> Iterator[Case]:
     yield refused(function, "rest", "type", None, "got None", "expected a number")
     yield refused(function, "mounting", "option", "down", "got 'down'", "'upright', 'random'")
     yield refused(function, "dtype", "option", "half", "got 'half'", "'float32', 'float64'")
-
-
-CASES = list(cases())

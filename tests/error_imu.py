@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 from error_arguments import (
-    ACCEPTED,
     F64,
     FOLDER,
     I64,
@@ -14,8 +13,10 @@ from error_arguments import (
     POSE,
     SPLINE,
     Case,
+    Q,
     T,
     V,
+    accept,
     changed,
     file,
     numbers,
@@ -26,7 +27,7 @@ from error_arguments import (
 )
 
 import torchspline.io as records
-from torchspline import SO3, BSpline, imu
+from torchspline import SO3, BSpline, Rn, imu
 
 THREE = torch.ones(3, dtype=F64)
 NOISE = imu.ImuNoise(0.1, 0.1)
@@ -44,8 +45,9 @@ YAML = file(
 )
 PARAMETERS = records.ImuParameters(NOISE, 100.0)
 
-ACCEPTED.update(
+accept(
     {
+        "measure": (imu.measure, {"trajectory": SPLINE, "t": T}),
         "Imu": (imu.Imu, {}),
         "Imu.forward": (IMU.forward, {"trajectory": SPLINE, "t": T}),
         "Imu.correct": (IMU.correct, {"readings": READINGS}),
@@ -71,6 +73,9 @@ _NUMBERS = "ImuNoise.inflated"
 _USES = "Imu.forward Imu.increments Imu.correct Magnetometer.forward Barometer.forward LowPass.forward"
 _FILES = "read_imu_parameters write_imu_parameters"
 _PARTS = "Imu Magnetometer Barometer ImuNoise LowPass"
+#: What is made and handed out.
+RESULTS = {"ImuReading", "Readings", "AmbientReadings"}
+UNTRIED = {"LowPass.extra_repr": "no arguments; PyTorch calls it"}
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE = {
     "shape": {"plain numbers or files": f"{_NUMBERS} {_FILES}"},
@@ -83,7 +88,9 @@ NOT_APPLICABLE = {
     "zero quaternion": {
         "no rotations that were not checked": f"{_NUMBERS} {_FILES} {_USES} ImuNoise LowPass Barometer"
     },
-    "count": {"any number of samples of a sensor": f"{_PARTS} {_NUMBERS} {_FILES} {_USES} ImuParameters"},
+    "count": {
+        "any number of samples of a sensor": f"measure {_PARTS} {_NUMBERS} {_FILES} {_USES} ImuParameters"
+    },
     "time": {"no times in parts of a sensor": f"{_PARTS} {_NUMBERS} {_FILES} Imu.correct ImuParameters"},
 }
 
@@ -115,12 +122,39 @@ def parameter(
 
 
 def cases() -> Iterator[Case]:
+    yield from ideal()
     yield from sensor()
     yield from ambient()
     yield from readings()
     yield from noise()
     yield from filters()
     yield from files()
+
+
+def ideal() -> Iterator[Case]:
+    function = "measure"
+    yield from times(function)
+    mount = POSE[0, 0]
+    for case in tensor(function, "T_body_imu", " (..., 7)", slice(3, 7), like=mount):
+        if case.changes["T_body_imu"] is not None:  # None: the body frame is the IMU's
+            yield case
+    yield refused(function, "T_body_imu", "device", mount.to("meta"), "meta", "cpu")
+    yield refused(function, "T_body_imu", "mixed dtype", mount.float(), "torch.float32", "torch.float64")
+    yield refused(function, "T_body_imu", "batch", mount.expand(3, 7), "(3,", "(2,")
+    yield refused(function, "trajectory", "type", POSE, "got Tensor", "expected a Trajectory")
+    plane, turning = BSpline(Rn(2).random(5), group=Rn(2), dt=0.1), BSpline(Q, group=SO3, dt=0.1)
+    for bad in (plane, turning):
+        yield refused(function, "trajectory", "option", bad, f"got {bad.group}", "SE3 or R3xSO3")
+    for name in ("gravity", "gyroscope_bias", "accelerometer_bias"):
+        for bad in ("down", [[1.0, 2, 3], [1]], [None] * 3, *((None,) if name == "gravity" else ())):
+            yield refused(function, name, "type", bad, f"got {bad!r}", "a tensor or three numbers")
+        yield from (
+            case
+            for case in tensor(function, name, " (..., 3)", None, "trajectory", like=V[0, 0])
+            if case.category != "type"
+        )
+        yield refused(function, name, "shape", (0.0, 9.8), "got (2,)", "expected shape (..., 3)")
+        yield refused(function, name, "batch", V[0, :4], f"{name} (4, 3)", "readings (2, 3, 3)")
 
 
 def sensor() -> Iterator[Case]:
@@ -317,6 +351,3 @@ def files() -> Iterator[Case]:
         (records.ImuParameters(NOISE, 100.0, calibration={"a": THREE}), "got a", "expected no calibration"),
     ):
         yield refused(function, "parameters", "option", bad, came, expected)
-
-
-CASES = list(cases())

@@ -2,9 +2,8 @@
 
 from collections.abc import Iterator
 
-import error_online  # noqa: F401  (whose cases are of what was accepted before this file added to it)
 import torch
-from error_arguments import ACCEPTED, F64, INF, NAN, Case, changed, refused, tensor
+from error_arguments import F64, INF, NAN, Case, accept, changed, refused, tensor
 
 from torchspline import imu
 
@@ -12,7 +11,7 @@ RECORD = torch.randn(2, 40, 3, generator=torch.Generator().manual_seed(0), dtype
 TIMES = torch.arange(40, dtype=F64)
 DEVIATION = imu.allan_deviation(RECORD, TIMES)
 NAMES = ("white_noise", "random_walk")
-ACCEPTED.update(
+accept(
     {
         "allan_deviation": (imu.allan_deviation, {"x": RECORD, "t": TIMES, "clusters": [1, 2]}),
         "AllanDeviation.bounds": (DEVIATION.bounds, {"confidence": 0.9}),
@@ -20,6 +19,8 @@ ACCEPTED.update(
     }
 )
 _DONE = "AllanDeviation.bounds fit_noise"
+#: What is made and handed out.
+RESULTS = {"AllanDeviation", "NoiseEstimate"}
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "shape": {"computed before": _DONE},
@@ -79,6 +80,3 @@ def cases() -> Iterator[Case]:
     for bad in (0.0, NAN):
         yield refused(function, "tau", "nan", (bad, 1.0), f"got {bad}", "above zero")
     yield refused(function, "tau", "count", (0.5, 2.5), "got 2", "more cluster times than components (2)")
-
-
-CASES = list(cases())

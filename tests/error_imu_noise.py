@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
-import error_online  # noqa: F401  (whose cases are of what was accepted before this file added to it)
 import torch
-from error_arguments import ACCEPTED, F64, INF, NAN, Case, T, changed, refused
+from error_arguments import F64, INF, NAN, Case, T, accept, changed, refused
 
 from torchspline import imu
 
@@ -15,7 +14,7 @@ _TIMED = {
     "gauss_markov": {"density": 0.1, "correlation_time": 5.0},
     "flicker_noise": {"level": 0.1, "correlation_times": (0.1, 5.0)},
 }
-ACCEPTED.update(
+accept(
     {
         "item_generator": (imu.item_generator, {"seed": 0, "index": 2}),
         "white_noise": (imu.white_noise, {"shape": SHAPE, "density": 0.1, "rate": 100.0}),
@@ -117,6 +116,3 @@ def times(function: str) -> Iterator[Case]:
     for bad in (NAN, INF):
         yield refused(function, "t", "nan", changed(T, 1, bad), f"got {bad}", "finite")
     yield refused(function, "t", "time", T.flip(0), "got 0.5 and then 0.2", "do not decrease")
-
-
-CASES = list(cases())

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import Any
 
-import error_online  # noqa: F401  (whose cases are of what was accepted before this file added to it)
 import torch
 from error_arguments import (
     ACCEPTED,
@@ -17,6 +16,7 @@ from error_arguments import (
     Q,
     T,
     V,
+    accept,
     changed,
     refused,
     tensor,
@@ -28,7 +28,7 @@ from torchspline import SO3, BSpline, Rn, imu
 READING = imu.ImuReading(V, V)  # (2, 8, 3)
 INTEGRALS = imu.Increments(V[:, :7], V[:, :7])
 START = imu.Navigation(Q[0, 0], V[0, 0], V[0, 0])
-ACCEPTED.update(
+accept(
     {
         "increments": (imu.increments, {"trajectory": SPLINE, "t": T}),
         "sampled_increments": (imu.sampled_increments, {"reading": READING, "t": STAMPS}),
@@ -44,6 +44,8 @@ _PAIRS = {
     "strapdown": ("increments", imu.Increments, ("angle", "velocity")),
 }
 
+#: What is made and handed out.
+RESULTS = {"Increments", "Navigation"}
 #: Where a kind of mistake cannot be made, as in test_errors.py.
 NOT_APPLICABLE: dict[str, dict[str, str]] = {
     "zero quaternion": {
@@ -152,6 +154,3 @@ def stamps(function: str) -> Iterator[Case]:
     yield refused(function, "t", "time", STAMPS.flip(0), "got 7.0 and then 6.0", "increasing times")
     yield refused(function, "t", "time", 0 * STAMPS, "got 0.0 and then 0.0", "increasing times")
     yield refused(function, "t", "device", STAMPS.to("meta"), "on device meta", "are on cpu")
-
-
-CASES = list(cases())

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytorch_kinematics as pk
 import torch
 from error_arguments import (
-    ACCEPTED,
     F32,
     F64,
     FOLDER,
@@ -17,6 +16,7 @@ from error_arguments import (
     Q,
     T,
     V,
+    accept,
     changed,
     file,
     numbers,
@@ -48,7 +48,7 @@ ROOTS = (robot, people, Robot.from_urdf, Robot.from_chain)
 RESULTS = {"Joint", "JointFit", "OverLimit", "Robot", "Response", "Skeleton"}
 UNTRIED = {"Skeleton.poses": "no arguments"}
 
-ACCEPTED.update(
+accept(
     {
         "from_urdf": (Robot.from_urdf, {"source": URDF}),
         "from_chain": (Robot.from_chain, {"chain": CHAIN}),
@@ -294,6 +294,3 @@ def bodies() -> Iterator[Case]:
     yield refused(function, "path", "option", FOLDER.name, "got a folder", "a file")
     yield refused(function, "path", "option", f"{FOLDER.name}/missing.bvh", "no such file", "missing.bvh")
     yield from numbers(function, "unit", 0.0, -1.0)
-
-
-CASES = list(cases())

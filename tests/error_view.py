@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from error_arguments import (
-    ACCEPTED,
     F64,
     FOLDER,
     I64,
@@ -16,6 +15,7 @@ from error_arguments import (
     SPLINE,
     Case,
     T,
+    accept,
     changed,
     refused,
     wholes,
@@ -62,7 +62,7 @@ def write_page(path: Any, trajectories: Any, **options: Any) -> None:
 
 _SHOWN = {"trajectories": ONE, "t": T}
 _PAGE = {"trajectories": ONE, "measured": POSE[0, :, :3], "samples": 5, "up": "z", "title": "x"}
-ACCEPTED.update(
+accept(
     {
         "trajectory": (plot.trajectory, {**_SHOWN, "frames": 2}),
         "rates": (plot.rates, {**_SHOWN, "quantities": ("velocity",)}),
@@ -254,6 +254,3 @@ def cases() -> Iterator[Case]:
     for function in ("Explorer.curve", "Explorer.curves", "Explorer.weights"):
         for bad in (1, 2.5):
             yield refused(function, "samples", "option", bad, f"got {bad}", "at least 2")
-
-
-CASES = list(cases())

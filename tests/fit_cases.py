@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchspline import R3, SE3, SO3, BSpline, Group, product
 from torchspline.fit import Problem, Variable
-from torchspline.fit.kernel import ResidualKernel
 from torchspline.fit.residual import Residual
 from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.solving.kernel import ResidualKernel
 
 #: The groups residuals are tried on, where they accept them; a product without a mechanical meaning among them.
 CANDIDATES = tuple(map(Group, ("SE3", "R3xSO3", "SO3", "R3", "R2", "SO3xSE3")))

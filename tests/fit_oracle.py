@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchspline import BSpline
 from torchspline.fit import Problem, Residual, Variable
-from torchspline.fit.kernel import kernel_of
-from torchspline.fit.problem import Linearizer
+from torchspline.fit.solving.kernel import kernel_of
+from torchspline.fit.solving.linearizer import Linearizer
 from torchspline.functional import bspline
 
 F64 = torch.float64

@@ -8,6 +8,8 @@ from fractions import Fraction
 from types import SimpleNamespace
 
 import mpmath as mp
+import numpy as np
+import scipy.interpolate
 import scipy.linalg
 import torch
 from batteries import hat, vee
@@ -31,6 +33,12 @@ namespace.register(
 def expm(matrices: Tensor) -> Tensor:
     """SciPy's matrix exponential: that of torch 2.13 is off by 3e-11 where the norm is about 0.03."""
     return torch.from_numpy(scipy.linalg.expm(matrices.numpy()))
+
+
+def scipy_rate(spline: scipy.interpolate.BSpline, t: np.ndarray, r: int) -> np.ndarray:
+    """The `r`-th derivative. Above the degree it is zero, and not to be asked for: SciPy 1.11 then writes where it must
+    not, and the process dies at some later time in some other place."""
+    return spline(t, r) if r <= spline.k else np.zeros((len(t), *spline.c.shape[1:]))
 
 
 def geodesic_derivatives(D: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:

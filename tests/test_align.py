@@ -7,7 +7,7 @@ import torch
 
 import torchspline
 from torchspline import SO3, BSpline, SplitBSpline, fit_poses, imu
-from torchspline.fit.align import align_imu
+from torchspline.fit import align_imu
 from torchspline.fit.losses import Huber
 from torchspline.io import read_imu, read_poses
 

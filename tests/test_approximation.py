@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 import pytest
+import scipy.interpolate
 import torch
 from batteries import generator, normal
 
@@ -179,6 +181,27 @@ def test_not_exact():
         assert max(turn, shift) > 1e-6
         for measured, told in ((turn, found.error.rotation_max), (shift, found.error.position_max)):
             assert told is None or measured < 1.2 * told + 1e-14
+
+
+@pytest.mark.parametrize(("order", "step"), [(4, 0.4), (5, 0.5), (6, 0.3)])
+def test_rotations_of_poses_are_met_by_split_splines_to_rounding(order, step):
+    """They are B-splines in SO3 in both: positions, which are none, do not hide what is left of them."""
+    source = uniform(SE3, order, step=step)
+    found = approximate(source, family=SplitBSpline)
+    assert found.error.rotation_max < 1e-13
+    assert found.error.position_max > 1e-4
+    # Control points of the rotations are those of the poses.
+    turned = SO3.log(SO3.between(source.control_points[:, 3:], found.trajectory.control_points[:, 3:]))
+    assert turned[2:-2].abs().max() < 1e-9
+    # Positions are as near as any spline over these knots comes, in the mean: least squares by dense algebra.
+    t = torch.linspace(*source.domain, 4001, dtype=float64)
+    k, M = order, len(source.control_points)
+    knots = source.domain[0] + (torch.arange(M + k) - (k - 1)) * 0.2
+    design = scipy.interpolate.BSpline.design_matrix(t, knots, k - 1, extrapolate=True).toarray()
+    goal = source(t)[:, :3].detach().numpy()
+    best = goal - design @ np.linalg.lstsq(design, goal, rcond=None)[0]
+    ours = (source(t) - found.trajectory(t))[:, :3].detach().numpy()
+    assert np.square(ours).mean() < 1.001 * np.square(best).mean()
 
 
 # ---------------------------------------------------------------------- within a tolerance

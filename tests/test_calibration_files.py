@@ -98,6 +98,16 @@ def test_kalibrs_words_are_understood(folder):
     (folder / "config.yaml").write_text(yaml.safe_dump(content))
     recording = read(folder)
     assert [asdict(x) for x in recording.noise] == [asdict(ImuNoise(0.3, 0.1, 0.4, 0.2))]
+    assert recording.time_offset is None
+    # Of a camchain-imucam.yaml: t_imu = t_cam + timeshift_cam_imu, as of `CamChain` and `Recording`.
+    content["cam0"]["timeshift_cam_imu"] = -0.0125
+    (folder / "config.yaml").write_text(yaml.safe_dump(content))
+    assert read(folder).time_offset == (-0.0125,)
+    for bad, words in (("soon", "expected a number"), (float("nan"), "expected a finite number, got nan")):
+        content["cam0"]["timeshift_cam_imu"] = bad
+        (folder / "config.yaml").write_text(yaml.safe_dump(content))
+        with pytest.raises(ValueError, match=rf"config.yaml: cam0: timeshift_cam_imu: {words}"):
+            read(folder)
     assert recording.cameras[0].distortion == "equidistant"
     assert recording.gravity == 9.80665
 

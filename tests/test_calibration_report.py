@@ -16,12 +16,11 @@ import torch
 import yaml
 
 from torchspline import R3, SE3, SO3, BSpline, cli
-from torchspline.calibrate import figures, find_start, write_calibration
+from torchspline.calibrate import figures, write_calibration
 from torchspline.calibrate.coverage import CELLS, coverage
 from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.simulate import Simulation, simulate
 from torchspline.cli.calibrate import rows
-from torchspline.fit import Result
 from torchspline.io import ImuRecord, read_camchain, write_imu
 
 SPACING = 0.05
@@ -376,14 +375,3 @@ def test_biases_over_time_of_a_second_imu_with_a_clock_of_its_own():
         low, high = imu.gyro_bias_spline.domain
         assert low <= int(record.time_ns[0]) < int(record.time_ns[-1]) <= high
         assert bool((imu.gyro_bias_sigma[1:-1] < 0.02).all())
-
-
-def test_too_many_unknowns_for_stretches_are_a_note(calibration, monkeypatch):
-    recording, options = calibration.recording.only(0), {"spacing": SPACING, "reweigh": False}
-    start = find_start(recording)
-    plain = calibrate(recording, start, stretch=None, **options)
-    monkeypatch.setattr(Result, "banded", property(lambda self: False))
-    wide = calibrate(recording, start, **options)
-    assert any("independent errors only" in note for note in wide.notes)
-    assert not any("independent errors only" in note for note in plain.notes)
-    assert torch.equal(wide.cameras[0].T_imu_cam_sigma, plain.cameras[0].T_imu_cam_sigma)

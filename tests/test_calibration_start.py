@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from torchspline import SE3, SO3
-from torchspline.calibrate import Corners, Recording, board_poses, find_start, read_recording
+from torchspline.calibrate import Corners, Recording, board_poses, calibrate, find_start, read_recording
 from torchspline.calibrate.simulate import Simulation, simulate
+from torchspline.calibrate.start import with_known_offsets
 from torchspline.io import ImuRecord
 
 NS = 1_000_000_000
@@ -41,6 +42,38 @@ def apart(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
     """Distances in m and rad of poses."""
     between = SE3.compose(SE3.inverse(a), b)
     return between[..., :3].norm(dim=-1), SO3.log(between[..., 3:]).norm(dim=-1)
+
+
+# ---------------------------------------------------------------------- time offsets that are known
+
+
+def test_known_time_offsets_are_where_the_search_begins(simulated, recording):
+    """Kalibr's `t_imu = t_cam + timeshift_cam_imu`: 25 s apart, and looked for within half a second."""
+    late = replace(recording.imus[0], time_ns=recording.imus[0].time_ns + 25 * NS)
+    apart = replace(recording, imus=(late,), time_offset=(25.0, 24.8))
+    found = find_start(apart, max_offset=0.5)
+    assert torch.allclose(found.time_offset, simulated.time_offset + 25.0, atol=5e-3)
+    assert any("cam1 with imu0: the clocks are 25.0" in note for note in found.notes)
+    assert not any("cam0 with imu0: the clocks" in note for note in found.notes)
+    assert abs(int(found.t_ns[0]) - int(late.time_ns[0])) < NS
+    kept = with_known_offsets(found, apart)
+    assert kept.time_offset.tolist() == [25.0, 24.8]
+    some = with_known_offsets(found, replace(apart, time_offset=(None, 24.8)))
+    assert some.time_offset.tolist() == [float(found.time_offset[0]), 24.8]
+    with pytest.raises(ValueError, match=r"cam0 with imu0: "):
+        find_start(replace(apart, time_offset=(-25.0, None)), max_offset=0.5)
+    part = apart.between(2.0, 4.0)
+    assert float(part.imus[0].time_ns[0] - part.corners[0].t_ns[0]) == pytest.approx(24.8 * NS, abs=0.1 * NS)
+    assert apart.only(1).time_offset == (24.8,)
+
+
+def test_known_time_offsets_stay_where_they_are_not_estimated(simulated, recording):
+    offsets = tuple(simulated.time_offset.tolist())
+    known = replace(recording, time_offset=offsets).between(0.0, 4.0).only(0)
+    options = {"spacing": 0.1, "reweigh": False, "stretch": None, "max_iterations": 3}
+    found = calibrate(known, estimate=(), **options)
+    assert found.cameras[0].time_offset == offsets[0]
+    assert found.cameras[0].time_offset_sigma is None
 
 
 # ---------------------------------------------------------------------- board poses

@@ -125,7 +125,7 @@ def test_kernels_show_prints_a_triton_kernel() -> None:
         (("imu", "nowhere.txt"), "nowhere.txt"),
         (("demo", "--duration", "1"), "duration: expected at least 2 s, got 1.0"),
         (("imu", "{poses}", "--rate", "0"), "rate: expected a finite number above zero (Hz), got 0.0"),
-        (("imu", "{poses}", "--spacing", "-5"), "dt: expected a finite number above zero"),
+        (("imu", "{poses}", "--spacing", "-5"), "spacing: expected a number above zero (ms)"),
         (("imu", "{poses}", "--margin", "1e3"), "margin: nothing is left"),
         (("imu", "{poses}", "--start", "1e3"), "nothing is left of the longest stretch"),
         (("imu", "{poses}", "--recorded", "{early}"), "has no reading between"),

@@ -121,7 +121,7 @@ def app():
     made.stop()
 
 
-def until(true, seconds=60.0):
+def until(true, seconds=180.0):
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end
@@ -188,7 +188,7 @@ def test_a_key_dragged_in_a_browser(app, tmp_path):
 
         scale = 0.25 * float(np.ptp(app.explorer.keyframes[:, :3].numpy(), axis=0).max())
         arrow = key[:3].numpy() + scale * np.array([0.75, 0.0, 0.0])
-        end = time.monotonic() + 60  # the scene is there a little later than its names
+        end = time.monotonic() + 180  # the scene is there a little later than its names
         while torch.equal(app.explorer.keyframes[0], key):
             assert time.monotonic() < end
             browser.drag(on_screen(arrow), on_screen(arrow + np.array([0.6, 0.0, 0.0])))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchspline import SO3, fit_poses
-from torchspline.fit.knots import Knots, _least, choose_spacing
+from torchspline.fit.poses.knots import Knots, _least, choose_spacing
 
 RATIO = 2**0.25
 

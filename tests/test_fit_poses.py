@@ -11,7 +11,7 @@ from scipy.interpolate import make_lsq_spline
 from spline_cases import chain
 
 from torchspline import R3, SE3, SO3, BSpline, fit_poses, product
-from torchspline.fit.banded import (
+from torchspline.fit.poses.banded import (
     difference_band,
     gram_band,
     solve_band,

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 import torchspline as ts
 from torchspline.fit.problem import Problem
 from torchspline.fit.residuals import Accelerometer, Gyroscope, Pose, StateValue, StateVelocity
-from torchspline.fit.system import SparseSystem
+from torchspline.fit.solving.system import SparseSystem
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, product
 
@@ -85,7 +85,7 @@ def test_covariances_are_blocks_of_the_inverse(group, bias_spline):
 def test_covariance_of_a_sparse_system_is_the_same(monkeypatch):
     problem, bias, *_ = inertial_problem()
     expected = problem.solve().covariance(bias)
-    monkeypatch.setattr("torchspline.fit.problem._WIDEST_BORDER", 0)
+    monkeypatch.setattr("torchspline.fit.solving.linearizer._WIDEST_BORDER", 0)
     again = problem.solve()
     assert isinstance(again._system, SparseSystem)
     assert_allclose(again.covariance(bias), expected, rtol=1e-7)

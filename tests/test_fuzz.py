@@ -46,7 +46,7 @@ def test_a_reader_that_misbehaves_is_found_out(fuzzing, tmp_path):
             os._exit(9)
 
     samples = [watch.Sample("x.txt", b"1 2 3\n" * 10)]
-    outcome = watch.watch("test", read, samples, tmp_path, 16, 0, 0.7, 2**28)
+    outcome = watch.watch("test", read, samples, tmp_path, 16, 0, 3.0, 2**28)
     found = [(x.index, x.kind) for x in outcome.findings]
     assert found == [(4, "crash"), (6, "hang"), (8, "memory"), (10, "message"), (12, "crash")]
     assert "KeyError" in outcome.findings[0].detail

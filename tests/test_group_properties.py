@@ -75,7 +75,7 @@ def size(*tensors):
 
 
 each_group = pytest.mark.parametrize("name", GROUPS)
-fast = settings(max_examples=40, deadline=None)
+fast = settings(max_examples=40)
 
 
 @each_group
@@ -170,7 +170,7 @@ def test_length_and_sign_of_stored_numbers_do_not_matter(name, dtype):
 def test_gradients_are_finite_at_the_edges(name):
     group = Group(name)
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(tangents(name), tangents(name))
     def check(x, y):
         x = x.clone().requires_grad_()

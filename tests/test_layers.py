@@ -13,7 +13,7 @@ MODULES = sorted((ROOT / PACKAGE).rglob("*.py"))
 
 # From the bottom to the top; those of one row stand side by side and do not import each other.
 LAYERS = [
-    {"checks", "errors"},
+    {"checks", "errors", "units"},
     {"arithmetic"},
     {"kernels"},
     {"groups"},
@@ -25,6 +25,17 @@ LAYERS = [
     {"cli"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
+# The same within `fit`, whose `__init__` stands above all of it. Those of one row may import each other.
+FIT_LAYERS = [
+    {"losses", "variables"},
+    {"residual"},
+    {"residuals", "solving"},
+    {"result", "smoothness"},
+    {"problem"},
+    {"alignment", "batch", "online", "poses"},
+    {"approximation"},
+]
+FIT_RANK = {name: rank for rank, names in enumerate(FIT_LAYERS) for name in names}
 # The public names: what `import torchspline` may bring in. Nothing in the package imports this.
 TOP = ""
 TOP_MAY_IMPORT = {name for name, rank in RANK.items() if rank <= RANK["fit"]} | {"functional"}
@@ -92,6 +103,28 @@ def test_there_is_something_to_check():
 def test_imports_go_downward(path):
     problems = violations(path.read_text(encoding="utf-8"), dotted(path))
     assert not problems, "\n".join(problems)
+
+
+def upward_in_fit(source: str, module: str) -> list[str]:
+    """Imports of `module` (`torchspline.fit.x`) from layers of `fit` above its own."""
+    parts, found = module.split("."), []
+    for line, name in imported(ast.parse(source), parts[:-1]):
+        package, layer, target = [*name.split("."), "", ""][:3]
+        if (package, layer) == (PACKAGE, "fit") and FIT_RANK[target] > FIT_RANK[parts[2]]:
+            found.append(f"{module}, line {line}: {target} is above {parts[2]}")
+    return found
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if dotted(p).count(".fit.")], ids=dotted)
+def test_imports_within_fit_go_downward(path):
+    if dotted(path) != f"{PACKAGE}.fit.__init__":
+        assert upward_in_fit(path.read_text(encoding="utf-8"), dotted(path)) == []
+
+
+def test_upward_imports_within_fit_are_found():
+    source = "from torchspline.fit.variables import Variable\nfrom ..problem import Problem"
+    (problem,) = upward_in_fit(source, f"{PACKAGE}.fit.solving.x")
+    assert problem == f"{PACKAGE}.fit.solving.x, line 2: problem is above solving"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=dotted)

@@ -10,16 +10,16 @@ import torch
 from numpy.testing import assert_allclose
 
 import torchspline as ts
-from torchspline.fit.bends import Bends
-from torchspline.fit.marginal import marginalised, random_walk
 from torchspline.fit.online import SlidingWindow
+from torchspline.fit.online.marginal import marginalised, random_walk
 from torchspline.fit.problem import Problem
 from torchspline.fit.residual import Clock
 from torchspline.fit.residuals import Accelerometer, Gyroscope, Pose, StateValue, StateVelocity
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import BandSystem
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.bends import Bends, Walk
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.system import BandSystem
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, product
 
@@ -474,3 +474,111 @@ def test_packets_of_one_kind_are_kept_together():
         ours = model(model.model.state())
     assert_allclose(ours.cost, joint.cost, rtol=1e-12)
     assert_allclose(ours.band, joint.band, rtol=1e-12)
+
+
+# ---------------------------------------------------------------------- biases that are splines
+
+
+def wandering(start, dt, nanoseconds=False, order=3):
+    """A bias with its first control points: the window appends the others."""
+    clock = {"dt_ns": round(dt * 1e9), "t0_ns": start} if nanoseconds else {"dt": dt, "t0": start}
+    points = torch.zeros(order, 3, dtype=F64)
+    return ts.BSpline(points, group=R3, order=order, learnable=not nanoseconds, **clock)
+
+
+@pytest.mark.parametrize(("nanoseconds", "knots"), [(False, 0.5), (True, 0.13), (False, 3.0)])
+def test_a_linear_window_with_a_spline_of_biases_equals_the_batch_solution(nanoseconds, knots):
+    """Turns about one axis commute, so that all is linear in what is about it; knots of the bias are farther apart or
+    closer than those of the trajectory, or farther than the window is long."""
+    origin = 10**18 if nanoseconds else 3.0
+    stamps = lambda t: (10**18 + (t * 1e9).round().to(torch.int64)) if nanoseconds else 3.0 + t  # noqa: E731
+    clock = {"dt_ns": 200_000_000, "t0_ns": origin} if nanoseconds else {"dt": 0.2, "t0": origin}
+    bias = wandering(origin, knots, nanoseconds)
+    window = SlidingWindow(SO3.identity(dtype=F64), group=SO3, window=1.0, smoothness=10.0, **clock)
+    window.random_walk(bias, 0.3)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+    seen, steps = [], 0
+    for n, t in enumerate(packets(6.0, 20.0, 6, start=0.02)):
+        if 8 < n < 11:  # a gap
+            continue
+        turned = SO3.exp((0.5 * t + 0.2 * t.sin() + 0.05 * random(len(t), seed=n))[:, None] * axis)
+        drift = (0.3 * t.sin())[:, None] + 0.02 * random(len(t), 1, seed=n + 99)
+        gyro = ((0.5 + 0.2 * t.cos())[:, None] + drift) * axis
+        for residual in (
+            StateValue(stamps(t), turned, sigma=0.05),
+            Gyroscope(stamps(t), gyro, sigma=0.02, bias=bias),
+        ):
+            window.add(residual)
+            seen.append((residual, {}))
+        result = window.update(**EXACT)
+        if n % 5 == 4:
+            online = bias.control_points.detach().clone()
+            before = window.trajectory.control_points
+            whole = window.trajectory
+            problem = Problem(whole)
+            for residual, _ in seen:
+                problem.add(residual)
+            with torch.no_grad():
+                linearizer = problem.prepare()
+                model = linearizer.model
+                linearizer.terms.append(Bends(model, np.full(3, 0.5)))  # 1 / (dt smoothness)
+                linearizer.terms.append(Walk(model, bias, np.full(3, 1.0 / (0.3 * math.sqrt(knots)))))
+                state, *_ = minimise(model, model.state(), linearizer, LINEAR, lambda _: None)
+            free = result._linearizer.model.splines[0].count
+            apart = SO3.log(SO3.between(torch.from_numpy(state.points[id(whole)]), before))[-free:]
+            assert_allclose(apart[:, 2], torch.zeros(free, dtype=F64), atol=1e-9)
+            moving = result._linearizer.model.splines[1].count
+            found = torch.from_numpy(state.points[id(bias)])
+            assert found.shape == online.shape
+            assert_allclose(online[-moving:], found[-moving:], atol=1e-9)
+            steps += 1
+    assert steps > 2
+    assert window._first > 20
+    assert window._wandering[bias].first >= len(bias.control_points) - moving
+    # What it learnt is the drift.
+    t = torch.linspace(1.0, 5.8, 40, dtype=F64)
+    if knots < 1.0:
+        assert (bias(stamps(t))[:, 2] - 0.3 * t.sin()).abs().mean() < 0.05
+
+
+def test_cost_of_an_update_with_a_spline_of_biases_does_not_depend_on_the_length():
+    window = SlidingWindow(SO3.identity(dtype=F64), group=SO3, dt=0.1, window=1.0)
+    bias = wandering(0.0, 0.3)
+    window.random_walk(bias, 0.1)
+    sizes = []
+    for n in range(60):
+        t = n * 0.2 + torch.arange(10, dtype=F64) / 50
+        window.add(StateValue(t, SO3.identity(10, dtype=F64), sigma=0.1))
+        window.add(Gyroscope(t, 0.1 * random(10, 3, seed=n), sigma=0.1, bias=bias))
+        model = window.update(max_iterations=1)._linearizer.model
+        sizes.append((model.total, sum(len(p.information) for p in window._priors)))
+    assert max(sizes[30:]) <= max(sizes[10:30])
+    assert window._wandering[bias].first > 30
+    assert len(window._streams) == 2
+    # The module is as long as the trajectory, and may go on.
+    assert bias.domain[1] >= 11.9
+    assert isinstance(bias.control_points, torch.nn.Parameter)
+    other = copy.deepcopy(window)
+    t = torch.tensor([12.0], dtype=F64)
+    other.add(StateValue(t, SO3.identity(1, dtype=F64), sigma=0.1))
+    other.update()
+    assert other._wandering.keys().isdisjoint(window._wandering)
+
+
+def test_a_spline_of_biases_that_starts_long_is_used_as_far_as_measurements_came():
+    points = torch.full((50, 3), 0.2, dtype=F64)
+    bias = ts.BSpline(points, group=R3, dt=0.5, learnable=False)
+    window = SlidingWindow(SO3.identity(dtype=F64), group=SO3, dt=0.1, window=1.0)
+    window.random_walk(bias, 0.1)
+    t = torch.linspace(0.0, 1.2, 60, dtype=F64)
+    window.add(StateValue(t, SO3.identity(60, dtype=F64), sigma=0.1))
+    window.add(Gyroscope(t, torch.full((60, 3), 0.4, dtype=F64), sigma=0.1, bias=bias))
+    result = window.update()
+    assert result._linearizer.model.splines[1].count == 6
+    assert torch.equal(bias.control_points[6:], points[6:])
+    assert (bias(t) - 0.4).abs().max() < 0.05
+    late = ts.BSpline(points, group=R3, dt=0.5, t0=1.0)
+    window.random_walk(late, 0.1)
+    early = Gyroscope(t[-40:], torch.zeros(40, 3, dtype=F64), bias=late)
+    with pytest.raises(ValueError, match=r"bias: .* lie outside the domain .* of its spline"):
+        window.add(early)

@@ -30,9 +30,9 @@ from torchspline.fit import (
     StateValue,
     Variable,
     smoothness,
-    terms,
 )  # fmt: skip
-from torchspline.fit.system import BandSystem
+from torchspline.fit.solving import terms
+from torchspline.fit.solving.system import BandSystem
 
 # ---------------------------------------------------------------------- each residual
 

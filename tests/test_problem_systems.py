@@ -11,7 +11,7 @@ from fit_oracle import Oracle, check_assembly
 
 from torchspline import SE3
 from torchspline.fit import Gyroscope, Point, Pose, Problem, RelativePose, Variable, smoothness
-from torchspline.fit.system import BandSystem, SparseSystem
+from torchspline.fit.solving.system import BandSystem, SparseSystem
 from torchspline.kernels import assemble
 
 # ---------------------------------------------------------------------- band, sparse, dense

@@ -1,5 +1,9 @@
 """Every residual: its hand-derived reverse, its compiled loop, its sizes, and its value by independent formulas."""
 
+import importlib
+import inspect
+import pkgutil
+
 import numpy as np
 import pytest
 import torch
@@ -17,10 +21,10 @@ from fit_cases import (
     sample,
 )
 
-from torchspline import R3, SE3, SO3, Group, product
-from torchspline.fit import RelativePose
-from torchspline.fit.kernel import ResidualKernel, kernel_of
+from torchspline import R3, SE3, SO3, Group, fit, product
+from torchspline.fit import RelativePose, Residual, residuals
 from torchspline.fit.residuals import RESIDUALS
+from torchspline.fit.solving.kernel import ResidualKernel, kernel_of
 
 each_kind = pytest.mark.parametrize("kind", RESIDUALS.values(), ids=RESIDUALS)
 
@@ -264,3 +268,16 @@ def test_groups_that_make_no_sense_are_refused():
                 ValueError, match=rf"{kind.__name__}: expected a trajectory in .*, got {group}"
             ):
                 kind.check_group(group)
+
+
+def test_every_file_of_residuals_is_named():
+    """A residual that is in the folder but not in the list would be in no battery."""
+    written: dict[str, object] = {}
+    for module in pkgutil.iter_modules(residuals.__path__, f"{residuals.__name__}."):
+        own = vars(importlib.import_module(module.name)).values()
+        kinds = [
+            x for x in own if inspect.isclass(x) and issubclass(x, Residual) and not inspect.isabstract(x)
+        ]
+        written |= {x.__name__: x for x in kinds if x.__module__ == module.name and x.__name__[0] != "_"}
+    assert written == RESIDUALS
+    assert set(RESIDUALS) <= set(fit.__all__)

@@ -8,7 +8,7 @@ import pytorch_kinematics as pk
 import torch
 from robot_cases import DRIVEN, F64, LINKS, MOUNT, NAMES, URDF, joint_spline, poses
 
-from torchspline import SE3, imu
+from torchspline import SE3, BSpline, Rn, imu
 from torchspline.robot import Robot
 
 ROBOT = Robot.from_urdf(URDF)
@@ -314,7 +314,9 @@ def test_limits_are_reported():
     spline.control_points = torch.nn.Parameter(points)
     t = torch.linspace(*spline.domain, 200, dtype=F64)
     found = {(x.joint, x.quantity): x for x in ROBOT.over_limits(spline, t)}
-    assert set(found) == {("pan", "position"), ("pan", "velocity"), ("close", "position")}
+    assert {x for x in found if x[0] not in ("follow", "copy")} == {
+        ("pan", "position"), ("pan", "velocity"), ("close", "position"),
+    }  # fmt: skip
     worst = found["pan", "position"]
     q = spline(t)[:, 0]
     assert worst.value == q.max().item()
@@ -325,9 +327,38 @@ def test_limits_are_reported():
     with torch.no_grad():
         batch.control_points[..., 2:] = 0.2
         batch.control_points[1, 2, :, 3] = -3.0
-    (only,) = ROBOT.over_limits(batch, t)
-    assert (only.joint, only.batch, only.limit) == ("close", (1, 2), 0.0)
+        batch.control_points[..., :, 3] = batch.control_points[..., :, 3].clamp(
+            max=0.03
+        )  # "follow" is 0.05 - close
+    found = {x.joint: x for x in ROBOT.over_limits(batch, t) if x.quantity == "position"}
+    assert set(found) == {"close", "follow", "copy"}
+    for name, value, limit in (("close", -3.0, 0.0), ("follow", 3.05, 1.0), ("copy", -1.4, 0.0)):
+        assert (found[name].batch, found[name].limit) == ((1, 2), limit)
+        assert found[name].value == pytest.approx(value, abs=1e-12)
     assert ROBOT.over_limits(joint_spline(scale=0.0), t) == []
+
+
+def test_joints_that_mimic_have_limits_of_their_own():
+    """By the formulas of `DRIVEN`, worked out by hand: follow = 0.05 - close, copy = 0.1 + close / 2."""
+    spline = joint_spline(scale=0.0)
+    t = torch.linspace(*spline.domain, 200, dtype=F64)
+    steps = torch.zeros_like(spline.control_points.detach())
+    steps[..., 3] = torch.linspace(0.0, 0.9, steps.shape[-2], dtype=F64)
+    spline.control_points = torch.nn.Parameter(steps)
+    close = spline(t)[:, 3].detach()
+    (only,) = ROBOT.over_limits(spline, t)
+    assert (only.joint, only.quantity, only.limit) == ("follow", "position", 0.0)
+    assert only.value == pytest.approx(0.05 - float(close.max()), abs=1e-14)
+    assert only.time == t[close.argmax()].item()
+    # Fast enough for "copy", which moves at half the rate, as for "close".
+    quick = BSpline(steps, group=Rn(4), dt=0.02)
+    t = torch.linspace(*quick.domain, 50, dtype=F64)
+    rate = float(quick.evaluate(t, 1).velocity[:, 3].detach().abs().max())
+    found = {x.joint: x for x in ROBOT.over_limits(quick, t) if x.quantity == "velocity"}
+    assert set(found) == {"close", "follow", "copy"}
+    for name, factor in (("close", 1.0), ("follow", 1.0), ("copy", 0.5)):
+        assert found[name].value == pytest.approx(factor * rate, rel=1e-12)
+    assert rate > 2.0
 
 
 # ---------------------------------------------------------------------- real robots

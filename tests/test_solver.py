@@ -23,8 +23,8 @@ from torchspline.fit import (
     Variable,
     smoothness,
 )
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import Factor, SingularError, System
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.system import Factor, SingularError, System
 from torchspline.kernels.mode import RefusedError
 
 # ---------------------------------------------------------------------- on functions of one number

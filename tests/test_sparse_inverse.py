@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix
 
-from torchspline.fit import system
+from torchspline.fit.solving import system
 
 
 @pytest.mark.parametrize("together", [1, 7, 40, 256])

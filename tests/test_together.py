@@ -5,10 +5,11 @@ import torch
 from numpy.testing import assert_allclose
 
 import torchspline as ts
+from torchspline.fit.batch import BatchProblem
 from torchspline.fit.losses import Huber
 from torchspline.fit.problem import Problem
-from torchspline.fit.residuals import Accelerometer, Gyroscope, Pose, StateValue
-from torchspline.fit.together import BatchProblem
+from torchspline.fit.residual import Clock
+from torchspline.fit.residuals import Accelerometer, Gyroscope, Pose, Position, StateValue
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, product
 
@@ -195,3 +196,173 @@ def test_what_a_batch_does_not_take_is_refused():
     result = problem.solve(max_iterations=0)
     with pytest.raises(ValueError, match="variable: x is not among the unknowns"):
         result.covariance(Variable("x", torch.zeros(3, dtype=F64)))
+
+
+# ---------------------------------------------------------------------- clocks, splines of biases, what stays
+
+#: Until nothing is left to gain: the solutions then agree to rounding, not to the tolerance of a cost.
+TIGHT = {"cost_tolerance": 0.0, "gradient_tolerance": 1e-11, "max_iterations": 60}
+
+
+def wandering(trajectories, seed=30):
+    """Gyroscope readings by clocks that are off, with biases that wander: times, which, readings; poses; biases."""
+    B = len(trajectories.control_points)
+    found = [[] for _ in range(6)]
+    drift = 0.05 * random(B, 7, 3, seed=seed).cumsum(1)
+    for b in range(B):
+        one = single(trajectories, b)
+        start, end = one.domain
+        bias = ts.BSpline(drift[b], group=R3, order=3, dt=0.25, t0=start - 0.1, learnable=False)
+        t = torch.linspace(start + 0.05, end - 0.05, 60 + 5 * b, dtype=F64)
+        stamps = t + 0.002 * (b + 1) + 0.01 * b * (t - 0.5 * (start + end))
+        gyro = ts.imu.measure(one, t).gyroscope + bias(stamps)
+        gyro = gyro + 0.002 * random(len(t), 3, seed=seed + b)
+        at = torch.linspace(start, end, 40, dtype=F64)
+        poses = one(at)
+        poses = one.group.retract(poses, 0.01 * random(len(at), 6, seed=seed + 50 + b), side="right")
+        whose = torch.full((len(t),), b), torch.full((len(at),), b)
+        columns = (stamps, whose[0], gyro, at, whose[1], poses)
+        for column, x in zip(found, columns, strict=True):
+            column.append(x)
+    return [torch.cat(x) for x in found]
+
+
+def clocked(problem, data, chosen, unknowns, which=(), of=()):
+    """The measurements of `wandering`, with their unknowns."""
+    t, _, gyro, at, _, poses = data
+    offset, skew, bias, lever = unknowns
+    there, seen = chosen
+    clock = Clock(offset=offset, skew=skew)
+    problem.add(Gyroscope(t[there], gyro[there], sigma=0.002, bias=bias, clock=clock), *which)
+    problem.add(Pose(at[seen], poses[seen], sigma=0.01), *of)
+    flat = torch.zeros(int(seen.sum()), 3, dtype=F64)
+    problem.add(Position(at[seen], poses[seen, :3] + flat, sigma=0.02, lever_arm=lever), *of)
+    for variable, sigma in ((offset, 0.01), (skew, 0.02), (lever, 0.1)):
+        problem.add_prior(variable, sigma=sigma)
+    problem.add(smooth_bias(at[seen], bias), *of)
+
+
+def smooth_bias(t, bias):
+    """Keeps control points that nothing else sees near where they start: a bias of a body at rest."""
+    return Gyroscope(t, torch.zeros(len(t), 3, dtype=F64), sigma=5.0, bias=bias, name="weak")
+
+
+def unknowns_of(start, *batch):
+    zeros = lambda *shape: torch.zeros(*batch, *shape, dtype=F64)  # noqa: E731
+    bias = ts.BSpline(zeros(7, 3), group=R3, order=3, dt=0.25, t0=start - 0.1, learnable=False)
+    return (
+        Variable("offset", zeros(1)),
+        Variable("skew", zeros(1)),
+        bias,
+        Variable("lever", zeros(3)),
+    )
+
+
+@pytest.mark.parametrize(("mode", "frozen"), [("reference", True), ("auto", True), ("auto", False)])
+def test_clocks_and_splines_of_biases_come_out_as_if_each_were_alone(mode, frozen):
+    B = 3
+    with ts.use_kernels(mode):
+        truth = windows(SE3, B, dt=0.1, t0=-2.0)
+        data = wandering(truth)
+        _, which, _, _, of, _ = data
+        start = perturbed(truth)
+        lead = truth.domain[0]
+        # Which control points and rows stay, another number in each trajectory.
+        stay = torch.zeros(B, 13, dtype=torch.bool)
+        bias_stays, lever_stays = torch.zeros(B, 7, dtype=torch.bool), torch.zeros(B, dtype=torch.bool)
+        if frozen:
+            stay[1, :4], stay[2], bias_stays[0, 2:4], bias_stays[2] = True, True, True, True
+            lever_stays[1] = True
+        truth.control_points.copy_(start)
+        problem, unknowns = BatchProblem(truth), unknowns_of(lead, B)
+        everything = (torch.ones(len(which), dtype=torch.bool), torch.ones(len(of), dtype=torch.bool))
+        clocked(problem, data, everything, unknowns, (which,), (of,))
+        if frozen:
+            problem.freeze(truth, stay)
+            problem.freeze(unknowns[2], bias_stays)
+            problem.freeze(unknowns[3], lever_stays)
+        result = problem.solve(**TIGHT)
+        assert result.converged.all(), result.reason
+        for b in range(B):
+            own, alone = unknowns_of(lead), single(truth, b)
+            alone.control_points.copy_(start[b])
+            one = Problem(alone)
+            clocked(one, data, (which == b, of == b), own)
+            if frozen:
+                one.freeze(alone, stay[b])
+                one.freeze(own[2], bias_stays[b])
+                if lever_stays[b]:
+                    one.freeze(own[3])
+            expected = one.solve(**TIGHT)
+            assert expected.converged
+            assert_allclose(result.cost[b], expected.cost[-1], rtol=1e-12)
+            at = torch.linspace(*truth.domain, 50, dtype=F64)
+            apart = SE3.log(SE3.between(alone(at), truth(at)[b]))
+            assert_allclose(apart, torch.zeros_like(apart), atol=1e-10)
+            assert_allclose(unknowns[2].control_points[b], own[2].control_points, atol=1e-10)
+            for i in (0, 1, 3):
+                assert_allclose(unknowns[i].value[b], own[i].value, atol=1e-10)
+                if i == 3 and lever_stays[b]:
+                    assert not result.covariance(unknowns[i])[b].any()
+                    continue
+                found = result.covariance(unknowns[i])[b]
+                assert_allclose(found, expected.covariance(own[i]), rtol=1e-6, atol=1e-18)
+        # The clocks are found: the offset is 2 ms more in each, the skew a hundredth.
+        assert_allclose(unknowns[0].value[0], torch.tensor([0.002], dtype=F64), atol=5e-4)
+
+
+def test_a_clock_may_leave_the_domain_without_meeting_the_next_trajectory():
+    """Measurements that an offset moves beyond the end have no weight; they are not those of the neighbour."""
+    truth = windows(SE3, 3)
+    poses, t = truth(torch.linspace(0.0, 1.0, 41, dtype=F64)), torch.linspace(0.0, 1.0, 41, dtype=F64)
+    problem = BatchProblem(truth)
+    offset = Variable("offset", torch.tensor([[0.0], [-0.3], [0.0]], dtype=F64))
+    which = torch.arange(3).repeat_interleave(41)
+    clock = Clock(offset=offset)
+    problem.add(Pose(t.repeat(3), poses.flatten(0, 1), sigma=0.1, clock=clock), which)
+    problem.freeze(truth)
+    result = problem.solve(max_iterations=0)
+    alone = Problem(single(truth, 1))
+    own = Variable("offset", offset.value[1])
+    alone.add(Pose(t, poses[1], sigma=0.1, clock=Clock(offset=own)))
+    expected = alone.solve(max_iterations=0)
+    assert expected.outside == 12
+    assert_allclose(
+        result.cost, torch.tensor([0.0, expected.cost[0], 0.0], dtype=F64), rtol=1e-12, atol=1e-20
+    )
+
+
+def test_what_stays_is_not_touched_and_can_be_released():
+    truth = windows(SE3, 2)
+    t = torch.linspace(0.0, 1.0, 40, dtype=F64)
+    values = truth(t)
+    exact = truth.control_points.clone()
+    truth.control_points.copy_(perturbed(truth))
+    truth.control_points[0] *= torch.tensor([1.0] * 3 + [3.0] * 4, dtype=F64)  # quaternions of any length
+    before = truth.control_points.clone()
+    problem = BatchProblem(truth)
+    bias = Variable("bias", torch.full((2, 3), 0.01, dtype=F64))
+    for b in range(2):
+        problem.add(StateValue(t, values[b], sigma=0.01), torch.full((40,), b))
+        gyro = ts.imu.measure(ts.BSpline(exact[b], group=SE3, dt=0.1), t).gyroscope.detach()
+        problem.add(Gyroscope(t, gyro, sigma=0.01, bias=bias), torch.full((40,), b))
+    problem.freeze(truth)
+    problem.freeze(bias)
+    with pytest.raises(ValueError, match="solve: everything is frozen"):
+        problem.solve()
+    problem.release(truth)
+    first = torch.zeros(2, 13, dtype=torch.bool)
+    first[0] = True
+    problem.freeze(truth, first)
+    problem.solve()
+    assert torch.equal(truth.control_points[0], before[0])
+    assert torch.equal(bias.value, torch.full((2, 3), 0.01, dtype=F64))
+    problem.release(truth)
+    problem.release(bias)
+    before = truth.control_points.clone()
+    problem.freeze(truth, torch.arange(13) < 2)  # of all trajectories
+    problem.solve()
+    assert torch.equal(truth.control_points[:, :2], before[:, :2])
+    problem.release(truth)
+    assert problem.solve(**TIGHT).cost.max() < 1e-15
+    assert_allclose(truth(t), values, atol=1e-9)

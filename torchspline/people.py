@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.knots import Knots
+from torchspline.fit.poses.knots import Knots
 from torchspline.groups.group import R3, SE3, SO3, product
 from torchspline.splines.bspline import SplitBSpline, bspline
 from torchspline.splines.keyframes import consistent_signs

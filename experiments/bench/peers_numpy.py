@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import RotationSpline
 
 from bench.problems import DT, Problem, UnavailableError
 from bench.timing import Task
+from torchspline.groups.convert import to_scipy
 from torchspline.splines.basis import cumulative_matrix
 
 Array = NDArray[Any]
@@ -93,6 +94,6 @@ def rotation_spline(problem: Problem) -> Task:
     if problem.order != 4 or problem.batch or problem.dtype != "float64":
         raise UnavailableError("one cubic in float64 only")
     knots = np.linspace(0, problem.segments * DT, problem.points)
-    rotations = Rotation.from_quat(problem.control_points().numpy(), scalar_first=True)
+    rotations = to_scipy(problem.control_points())
     spline, t = RotationSpline(knots, rotations), problem.times().numpy()
     return Task(lambda: [spline(t, r) for r in range(problem.derivatives + 1)], problem.total)

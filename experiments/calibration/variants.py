@@ -14,14 +14,15 @@ import torch
 from simulated.baseline import product_rule, vee
 from torch import Tensor
 
+from torchspline import BSpline
 from torchspline.arithmetic.recurrence import forward
 from torchspline.calibrate.problem import Layout
-from torchspline.fit.kernel import ResidualKernel
-from torchspline.fit.model import State
-from torchspline.fit.problem import Linearizer
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import Rows, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.kernel import ResidualKernel
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import State
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.system import Rows, System
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import SO3, Group
 from torchspline.groups.components import join, split
@@ -74,37 +75,34 @@ def by_product_rule(group: Group, order: int, spacing: float, derivatives: int) 
 def _position(points: Tensor, u: Tensor, order: int, derivatives: int) -> list[Tensor]:
     steps = points.diff(dim=0)
     weights = cumulative_weights(u, order, max(derivatives, 1))
-    return [sum(w * d for w, d in zip(row, steps, strict=True)) for row in weights[1:]]  # type: ignore[misc]
+    return [torch.stack([w * d for w, d in zip(row, steps, strict=True)]).sum(0) for row in weights[1:]]
 
 
-class AutomaticTerm:
-    """Does what `Term` does, the slow way."""
+class AutomaticTerm(Term):
+    """A term whose rows come the slow way."""
 
     def __init__(self, term: Term, states: Callable[..., States]):
-        self.term = term
+        vars(self).update(vars(term))  # bound already
         spline, kind = term.model.trajectory, type(term.residual)
         self.group = Group(spline.name)
         self.states = states(self.group, spline.order, spline.spacing, kind.derivatives)
 
-    def touched(self, state: State) -> np.ndarray:
-        return self.term.touched(state)
-
     def add_to(self, system: System, state: State) -> None:
-        term, places = self.term, self.term.places(state)
+        places = self.places(state)
         assert state.chain is not None
-        spline = term.model.trajectory
+        spline = self.model.trajectory
         points = torch.from_numpy(state.points[id(spline.module)])
         windows = torch.from_numpy(places.base[0])[:, None] + torch.arange(spline.order)
-        u, measured = torch.from_numpy(places.u[0]), torch.from_numpy(term.measured)
+        u, measured = torch.from_numpy(places.u[0]), torch.from_numpy(self.measured)
         function, size, each = self._function(state)
-        own = [torch.from_numpy(x.detach().numpy()[term.order]) for x in each]
+        own = [torch.from_numpy(x.detach().numpy()[self.order]) for x in each]
         vectorised = torch.vmap(torch.func.jacfwd(function, has_aux=True))
         rows = []
         for part in torch.arange(len(u)).split(CHUNK):
             still = torch.zeros(len(part), size, dtype=torch.float64)
             J, r = vectorised(still, points[windows[part]], u[part], measured[part], [x[part] for x in own])
             slice_ = slice(int(part[0]), int(part[-1]) + 1)
-            error, weight, costs = term._weigh(r.numpy(), slice_, places.outside[slice_])
+            error, weight, costs = self._weigh(r.numpy(), slice_, places.outside[slice_])
             system.cost += float(costs.sum())
             weighted = J.numpy() if weight is None else weight[..., None] * J.numpy()
             rows.append(np.concatenate([weighted, error[..., None]], axis=-1))
@@ -118,19 +116,19 @@ class AutomaticTerm:
 
     def _function(self, state: State) -> tuple[Callable[..., tuple[Tensor, Tensor]], int, list[Tensor]]:
         """The residual of one measurement from a step of all it depends on; how long that is; arguments of each."""
-        term, spline, kernel = self.term, self.term.model.trajectory, self.term.kernel
+        spline, kernel = self.model.trajectory, self.kernel
         assert isinstance(kernel, ResidualKernel)
-        arguments = term.residual.arguments
+        arguments = self.residual.arguments
         inner = spline.order * spline.size
         moves: dict[str, tuple[int, Callable[[Tensor], Tensor]]] = {}
         at = inner
-        for slot in term.movable:
+        for slot in self.movable:
             variable = arguments[slot]
             assert isinstance(variable, Variable)
             moves[slot] = at, _mover(variable, state.values[id(variable)])
             at += variable.dimension
-        clocked, size = bool(term.clock), at + len(term.clock)
-        each = [x for slot in kernel.order if slot in term.each and isinstance(x := arguments[slot], Tensor)]
+        clocked, size = bool(self.clock), at + len(self.clock)
+        each = [x for slot in kernel.order if slot in self.each and isinstance(x := arguments[slot], Tensor)]
 
         def residual(
             step: Tensor, window: Tensor, u: Tensor, measured: Tensor, own: list[Tensor]
@@ -143,12 +141,13 @@ class AutomaticTerm:
             vectors, given = [*self.states(moved, place), measured], iter(own)
             for slot in kernel.order:
                 x = arguments[slot]
-                if slot in term.each:
+                if slot in self.each:
                     vectors.append(next(given))
                 elif slot in moves:
                     start, move = moves[slot]
                     vectors.append(move(step[start:]))
                 else:
+                    assert not isinstance(x, BSpline)
                     vectors.append(state.values[id(x)] if isinstance(x, Variable) else x)
             error = kernel.on_tensors(*vectors)
             return error, error
@@ -178,7 +177,7 @@ def solve_automatically(layout: Layout, states: Callable[..., States], **options
     with torch.no_grad():
         linearizer = layout.problem.prepare()
         terms = [AutomaticTerm(term, states) for term in linearizer.terms if isinstance(term, Term)]
-        slow = Linearizer(linearizer.model, terms)  # type: ignore[arg-type]
+        slow = Linearizer(linearizer.model, terms)
         model = linearizer.model
         state, _, trace = minimise(model, model.state(), slow, Options(**options), lambda trace: None)
         model.store(state)

@@ -82,7 +82,8 @@ class Segment:
         start, *self.d = map(self._counted, random.normal(size=(order, len(self._generators))))
         cumulative = BSpline(np.arange(1 - order, order + 1), np.tril(np.ones((order, order))), order - 1)
         #: lambda_1 ... lambda_(k-1), [S20] (21), and their derivatives: one row each.
-        self.l = np.array([cumulative(u, nu)[1:] for nu in range(3)])
+        # Not asked above the degree: SciPy 1.11 writes where it must not then.
+        self.l = np.array([cumulative(u, nu)[1:] if nu < order else np.zeros(order - 1) for nu in range(3)])
         self.start = self._counted(expm(self.hat(start).array))
         self.D = [self.hat(d) for d in self.d]
         self.A = [self._counted(expm(l * D.array)) for l, D in zip(self.l[0], self.D, strict=True)]

@@ -16,7 +16,10 @@ TOKENS = (
     b": ", b"- ", b"&a ", b"*a", b"<<: ", b"!!python/object:os.system ", b"!!binary ", b"!!timestamp ", b"2001-99-99",
     b"{", b"}", b"[", b"]", b"[[", b"%YAML:1.0\n", b"---\n", b"...\n", b"|", b">", b"\\", b"\\u0000", b"\xc2\xa0",
     b"cam0", b"imu0", b"ROOT", b"JOINT", b"CHANNELS", b"End Site", b"MOTION", b"Frames:", b"9" * 5000, b"1e400000000",
-    b"R1000000000", b"R3x" * 500, b"\xf0\x9f\x9a\x80", b"\x00" * 16, b"\xff" * 16, b"\x7f\xff\xff\xff",
+    b"R1000000000", b"R3x" * 500, b"\xf0\x9f\x9a\x80",
+    b"<", b"</", b"/>", b"<!--", b"&x;", b"&#0;",
+    b"<!DOCTYPE a [<!ENTITY x SYSTEM '/dev/zero'>]>", b"<include file='/dev/zero'/>", b"<body>", b"<joint/>",
+    b"\x00" * 16, b"\xff" * 16, b"\x7f\xff\xff\xff",
 )  # fmt: skip
 _NUMBER = re.compile(rb"[-+]?[0-9]+\.?[0-9]*(?:[eE][-+]?[0-9]+)?")
 #: Sizes of what bombs unpack to, bytes: more than a reader may use.
@@ -110,6 +113,8 @@ def whole(data: bytes, rng: Random) -> bytes:
             b"1 2 3 4 5 6 7 8\n" * 1_000,
             data * rng.randrange(2, 20),
             aliases(rng),
+            entities(data, rng),
+            nested(rng),
         )
     )
 
@@ -120,6 +125,28 @@ def aliases(rng: Random) -> bytes:
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
     name = rng.choice(("update_rate", "gyroscope_noise_density", "T_BS", "cam0", "imu0", "gyroscopes"))
     return "\n".join([*lines, f"{name}: *a19", ""]).encode()
+
+
+def entities(data: bytes, rng: Random) -> bytes:
+    """An XML file of a few lines whose text, written out, has 10^9 characters; alone, or in what was valid."""
+    lines = ["<!DOCTYPE root [", ' <!ENTITY a0 "xxxxxxxxxx">']
+    lines += [f' <!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 9)]
+    content = rng.choice(
+        ("<root>&a8;</root>", '<mujoco model="&a8;"/>', "<robot name='&a8;'><link name='x'/></robot>")
+    )
+    inside = data.replace(b'"', b'"&a8;', 1).partition(b"?>")[2] or data
+    return "\n".join([*lines, "]>", ""]).encode() + rng.choice((content.encode(), inside))
+
+
+def nested(rng: Random) -> bytes:
+    """XML that goes deep."""
+    name, depth = (
+        rng.choice(("body", "default", "replicate", "frame", "a")),
+        rng.choice((100, 3_000, 100_000)),
+    )
+    inner = rng.choice(("", "".join(f"</{name}>" for _ in range(depth))))
+    outer = rng.choice(("", "<mujoco><worldbody>"))
+    return f"{outer}{f'<{name}>' * depth}{inner}{'</worldbody></mujoco>' if outer else ''}".encode()
 
 
 SIMPLE: tuple[Callable[[bytes, Random], bytes], ...] = (

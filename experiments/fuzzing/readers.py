@@ -27,7 +27,7 @@ class Reader(NamedTuple):
 
 
 def readers(seed: int) -> dict[str, Reader]:
-    """By name. Those of ROS bags only where the package rosbags is installed."""
+    """By name. Those of ROS bags and MJCF only where the packages rosbags and mujoco are installed."""
     generator = torch.Generator().manual_seed(seed)
     poses = ts.SE3.random(_ROWS, generator=generator)
     record = io.PoseRecord(
@@ -84,6 +84,8 @@ def _readers(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str
     found |= _calibration(folder, samples)
     if find_spec("pyarrow"):
         found |= _data_sets(folder)
+    if find_spec("mujoco"):
+        found["Robot.from_mjcf"] = Reader(Robot.from_mjcf, [Sample("arm.xml", _MJCF)])
     return found | (_bags(folder, record, imu) if find_spec("rosbags") else {})
 
 
@@ -162,6 +164,10 @@ def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, R
 
     io.write_rosbag(folder / "both", {"/pose": record, "/imu": imu})
     mcap = Sample("both.mcap", (folder / "both" / "both.mcap").read_bytes())
+    trees = []
+    for name in ("tree.mcap", "tree.bag"):
+        io.write_rosbag(folder / name, {"/tf": record}, "TFMessage")
+        trees.append(Sample(name, (folder / name).read_bytes()))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     old = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     kind = "geometry_msgs/msg/PoseStamped"
@@ -178,6 +184,7 @@ def _bags(folder: Path, record: io.PoseRecord, imu: io.ImuRecord) -> dict[str, R
     (database,) = (folder / "sqlite").glob("*.db3")
     return {
         "read_poses, ROS 2 MCAP": Reader(io.read_poses, [mcap]),
+        "read_poses, ROS transforms": Reader(io.read_poses, trees),
         "read_imu, ROS 2 MCAP": Reader(io.read_imu, [mcap]),
         "read_poses, ROS 2 SQLite": Reader(io.read_poses, [Sample("x.db3", database.read_bytes())]),
         "read_poses, ROS 1": Reader(io.read_poses, [Sample("old.bag", (folder / "old.bag").read_bytes())]),
@@ -259,6 +266,39 @@ _URDF = b"""<?xml version="1.0"?>
     <mimic joint="elbow" multiplier="2.0" offset="0.1"/>
   </joint>
 </robot>
+"""
+
+_MJCF = b"""<?xml version="1.0"?>
+<mujoco model="arm">
+  <compiler angle="degree" autolimits="true"/>
+  <option timestep="0.002" gravity="0 0 -9.81"/>
+  <size memory="1M"/>
+  <default>
+    <joint damping="0.1"/>
+    <default class="small"><geom type="sphere" size="0.02"/></default>
+  </default>
+  <asset>
+    <texture name="sky" builtin="gradient" rgb1="1 1 1" rgb2="0 0 0" width="8" height="8"/>
+    <material name="grey" rgba="0.5 0.5 0.5 1"/>
+    <hfield name="hill" nrow="3" ncol="3" size="1 1 0.1 0.1" elevation="0 0 0 0 1 0 0 0 0"/>
+    <mesh name="tetrahedron" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1" material="grey"/>
+    <body name="upper" pos="0 0 0.3" quat="0.9 0.1 0.2 0.3">
+      <joint name="shoulder" type="hinge" axis="0 0 1" range="-90 90"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0.4 0 0"/>
+      <body name="lower" pos="0.4 0 0" euler="0 10 0">
+        <joint name="elbow" type="slide" axis="1 0 0" range="0 0.5" ref="0.1"/>
+        <geom class="small" mass="0.1"/>
+        <site name="imu" pos="0.1 0 0" size="0.01"/>
+        <replicate count="3" offset="0.1 0 0"><site name="r" size="0.01"/></replicate>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m" joint="shoulder" gear="2"/></actuator>
+  <keyframe><key name="home" qpos="0.1 0.2"/></keyframe>
+</mujoco>
 """
 
 _CONFIG = b"""calib_target:

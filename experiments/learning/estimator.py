@@ -150,7 +150,8 @@ class Calibrator(nn.Module):
         turned = grouped(SO3.act(rotation, corrected.accelerometer, validate=False))
         middle = rotation[:, GROUP // 2 :: GROUP]
         size = min(round(length / h), rate.shape[1])
-        H, right = self._velocity(*(stretches(x, size) for x in (rate, force, turned, middle)), h, weights)
+        stretched = [stretches(x, size) for x in (rate, force, turned, middle)]
+        H, right = self._velocity(*stretched, h=h, weights=weights)
         # Bodies turn to and fro, and some of the time they rest.
         if weights is None:
             still = torch.ones_like(rate[..., :1])

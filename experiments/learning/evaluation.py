@@ -4,12 +4,13 @@ import math
 from typing import NamedTuple
 
 import torch
-from recordings.load import SECOND, Recording, usable
+from recordings.load import Recording, usable
 from torch import Tensor
 
 from learning.training import LAGS
 from torchspline import SO3, imu
 from torchspline.io import PoseRecord
+from torchspline.units import SECOND
 
 #: s, between the starts of compared windows.
 STRIDE = 0.5

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchspline import SO3, SplitBSpline, imu
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses
+from torchspline.units import SECOND
 
-SECOND = 1_000_000_000
 #: Poses farther apart than this leave a gap.
 GAP = 30_000_000
 

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchspline.fit.model import Model, State
-from torchspline.fit.system import Rows, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.system import Rows, System
+from torchspline.fit.solving.terms import Term
 from torchspline.groups import Group
 from torchspline.splines.basis import cumulative_weights
 
@@ -33,6 +33,7 @@ class BaselineTerm:
     def add_to(self, system: System, state: State) -> None:
         model, places = self.term.model, self.term.places(state)
         spline = model.trajectory
+        assert state.chain is not None
         points = torch.from_numpy(state.points[id(spline.module)])
         windows = points[torch.from_numpy(places.base[0])[:, None] + torch.arange(spline.order)]
         u, measured = torch.from_numpy(places.u[0]), torch.from_numpy(self.term.measured)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.arithmetic.camera import CAMERA_MODELS
 from torchspline.calibrate.recording import Corners
-from torchspline.fit.residuals import ReprojectionEquidistant, ReprojectionRadtan
 from torchspline.groups.group import SO3
 from torchspline.io.camera import Camera
 
@@ -38,7 +38,6 @@ _ITERATIONS = 30
 _SETTLED = 1e-7
 #: Angle to the optical axis up to which corners take part in a homography.
 _WIDEST = math.radians(80.0)
-_MODELS: dict[str, Any] = {"radtan": ReprojectionRadtan, "equidistant": ReprojectionEquidistant}
 #: Trials to find corners that agree, and errors (px) up to which they do, at first and in the end.
 _TRIALS, _AGREEING = 80, (8.0, MISFIT)
 #: Why an image has no pose.
@@ -238,13 +237,13 @@ def _undistort(camera: Camera, u: Array, v: Array) -> tuple[Array, Array, Array]
         found = (np.abs(value - r) < 1e-6) & (theta < _WIDEST) & (theta >= 0)
         stretch = np.where(found, np.tan(theta.clip(0.0, _WIDEST)), 0.0) / r.clip(1e-12)
         return x * stretch, y * stretch, found
-    model, one = _MODELS[camera.distortion], np.ones_like(x)
+    model, one = CAMERA_MODELS[camera.distortion], np.ones_like(x)
     a, b = x, y
     for _ in range(8):
         at = (a, b, one)
-        p, q = model._distort(at, k)
-        (paa, pab, _), _ = model._distort_reverse(at, k, (1.0, 0.0))
-        (qaa, qab, _), _ = model._distort_reverse(at, k, (0.0, 1.0))
+        p, q = model.distort(at, k)
+        (paa, pab, _), _ = model.distort_reverse(at, k, (1.0, 0.0))
+        (qaa, qab, _), _ = model.distort_reverse(at, k, (0.0, 1.0))
         determinant = paa * qab - pab * qaa
         da, db = (qab * (p - x) - pab * (q - y)) / determinant, (paa * (q - y) - qaa * (p - x)) / determinant
         a, b = a - da, b - db
@@ -296,12 +295,12 @@ class _State(NamedTuple):
 
 def _linearize(camera: Camera, block: _Block, R: Array, t: Array) -> _State:
     """At poses `p_cam = R p_board + t`; steps (v, w) change p_cam by v + w x p_cam."""
-    model, k = _MODELS[camera.distortion], camera.coefficients
+    model, k = CAMERA_MODELS[camera.distortion], camera.coefficients
     fu, fv, pu, pv = camera.intrinsics
     x, y = block.x, block.y
     p = [R[:, i, 0, None] * x + R[:, i, 1, None] * y + t[:, i, None] for i in range(3)]
-    point, shown = model._visible(tuple(p))
-    plane = model._distort(point, k)
+    point, shown = model.visible(tuple(p))
+    plane = model.distort(point, k)
     there = block.there.astype(np.float64) * shown
     hidden = _HIDDEN * (block.there & (shown == 0))
     residual = np.stack(
@@ -314,7 +313,7 @@ def _linearize(camera: Camera, block: _Block, R: Array, t: Array) -> _State:
     root = np.sqrt(weight)
     rows = []
     for focal, unit, e in zip((fu, fv), ((1.0, 0.0), (0.0, 1.0)), residual, strict=True):
-        (gx, gy, gz), _ = model._distort_reverse(point, k, unit)
+        (gx, gy, gz), _ = model.distort_reverse(point, k, unit)
         f = focal * root
         gx, gy, gz = gx * f, gy * f, gz * f
         turning = (p[1] * gz - p[2] * gy, p[2] * gx - p[0] * gz, p[0] * gy - p[1] * gx)

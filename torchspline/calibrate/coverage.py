@@ -11,6 +11,7 @@ from torchspline.calibrate.estimate import CalibratedCamera, CalibratedImu, Cali
 from torchspline.calibrate.recording import Corners
 from torchspline.groups.group import SO3
 from torchspline.io.camera import Camera
+from torchspline.units import NANOSECOND
 
 #: Cells of an image, columns and rows, and the share of a camera's corners that a covered cell has at least.
 CELLS, _FEW = (8, 5), 0.001
@@ -75,7 +76,7 @@ def coverage(calibration: Calibration) -> Coverage:
     """How much the recording of a calibration tells."""
     used = calibration.imus[0].gyroscope.used
     t = calibration.recording.imus[0].time_ns[used]
-    duration = float(t[-1] - t[0]) * 1e-9
+    duration = float(t[-1] - t[0]) * NANOSECOND
     step = max(1, len(t) // _MOST_TIMES)
     with torch.no_grad():
         motion = calibration.trajectory.kinematics(t[::step])

@@ -18,12 +18,13 @@ from torchspline.calibrate.problem import (
     build,
 )
 from torchspline.calibrate.recording import Recording
-from torchspline.calibrate.start import Start, find_start
+from torchspline.calibrate.start import Start, find_start, with_known_offsets
 from torchspline.calibrate.weights import noise_factors, rescale, sigma_of
 from torchspline.fit.losses import Huber, Loss
 from torchspline.fit.residual import Residual
-from torchspline.fit.result import OpenDirection, Result, control_point_deviation
-from torchspline.fit.solver import Options as Solver
+from torchspline.fit.result import OpenDirection, Result
+from torchspline.fit.solving.model import spacing_of
+from torchspline.fit.solving.solver import Options as Solver
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
 from torchspline.splines.bspline import BSpline
@@ -194,7 +195,8 @@ def calibrate(
     measurement of its pose, see `ImageBlock`. Cost is linear in the length of the recording.
 
     Args:
-        start: where to begin; by default `find_start(recording)`.
+        start: where to begin; by default `find_start(recording)`, with time offsets that the recording knows where they
+            are not estimated.
         order, spacing [s]: of the trajectory's spline. Knots farther apart smooth what IMU readings say of fast motion.
         representation: "split" (R3 x SO3) or "joint" (SE3); results are the same.
         estimate: besides trajectory, extrinsics, gravity and biases: "time_offset" of every camera, "intrinsics" of
@@ -211,6 +213,7 @@ def calibrate(
         stretch: s. Standard deviations hold when errors are alike over stretches of this length, see
             `Result.standard_deviation`: biases that wander, a distortion that is not quite the lens's, corners that are
             all seen too far inside. On real recordings those are ten times what independent errors (None) would give.
+            For biases that are splines no longer than `bias_spacing`.
         max_iterations, cost_tolerance: of the solver, see `fit.Problem.solve`.
         progress: show a progress bar on a terminal.
     Returns:
@@ -232,6 +235,8 @@ def calibrate(
     seconds = {}
     if start is None:
         start = find_start(recording)
+        if "time_offset" not in options.estimate:
+            start = with_known_offsets(start, recording)
     else:
         _check_start(start, recording)
     seconds["start"] = perf_counter() - begin
@@ -256,11 +261,6 @@ def calibrate(
     seconds["solve"] = perf_counter() - now - seconds["weights"]
     now = perf_counter()
     notes = _notes(result, start)
-    if stretch is not None and not result.banded:
-        stretch = None
-        notes.append(
-            "standard deviations hold for independent errors only: there are too many unknowns for stretches"
-        )
     found = _Found(layout, result, stretch, stated, layout.frozen)
     cameras = tuple(_camera(recording, found, i) for i in range(len(recording.cameras)))
     imus = tuple(_imu(found, i) for i in range(len(recording.imus)))
@@ -347,8 +347,11 @@ class _Found(NamedTuple):
     stated: dict[str, float]
     frozen: list[Variable]
 
-    def sigma(self, variable: Variable) -> Tensor:
-        return self.result.standard_deviation(variable, self.stretch)
+    def sigma(self, variable: Variable | BSpline) -> Tensor:
+        stretch = self.stretch
+        if stretch is not None and isinstance(variable, BSpline):
+            stretch = min(stretch, spacing_of(variable))
+        return self.result.standard_deviation(variable, stretch)
 
     def sigma_if(self, variable: Variable | None) -> Tensor | None:
         """None if it was not estimated."""
@@ -390,11 +393,7 @@ def _imu(found: _Found, i: int) -> CalibratedImu:
         if isinstance(x, Variable):
             fields |= {kind: x.value, f"{kind}_sigma": found.sigma(x)}
         else:
-            fields |= {
-                kind: x.control_points.detach(),
-                f"{kind}_sigma": control_point_deviation(found.result, x),
-            }
-            fields[f"{kind}_spline"] = x
+            fields |= {kind: x.control_points.detach(), f"{kind}_spline": x, f"{kind}_sigma": found.sigma(x)}
     for kind, y in (("gyro_scaling", unknowns.gyro_scaling), ("accel_scaling", unknowns.accel_scaling)):
         if y is not None:
             fields |= {kind: y.value.reshape(3, 3), f"{kind}_sigma": found.sigma(y).reshape(3, 3)}

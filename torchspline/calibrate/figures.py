@@ -13,9 +13,9 @@ from torchspline.calibrate.coverage import CELLS, cells
 from torchspline.calibrate.estimate import Calibration, SensorResiduals
 from torchspline.imu import ImuReading
 from torchspline.plot import imu_comparison
+from torchspline.units import NANOSECOND
 
 Array = NDArray[Any]
-_NS = 1e-9
 #: Points that a figure shows of a sensor, at most.
 _MOST_POINTS = 4000
 #: Length of the excerpt that compares readings, s.
@@ -28,11 +28,11 @@ def residuals_over_time(calibration: Calibration) -> bytes:
     zero = calibration.recording.start_ns
     for i, camera in enumerate(calibration.cameras):
         t, rms = _by_image(calibration, i)
-        panels.append((f"{camera.name}, RMS of an image [px]", _dots((t - zero) * _NS, rms)))
+        panels.append((f"{camera.name}, RMS of an image [px]", _dots((t - zero) * NANOSECOND, rms)))
     for j, imu in enumerate(calibration.imus):
         stamps = calibration.recording.imus[j].time_ns
         for residuals in (imu.gyroscope, imu.accelerometer):
-            seconds = ((stamps[residuals.used] - zero).double() * _NS).numpy()
+            seconds = ((stamps[residuals.used] - zero).double() * NANOSECOND).numpy()
             panels.append((f"{residuals.name} [{residuals.unit}]", _axes_over(seconds, residuals)))
     figure, all_axes = _figure(len(panels), 1, (11, 1.9 * len(panels)), sharex=True)
     for axes, (title, draw) in zip(all_axes[:, 0], panels, strict=True):
@@ -119,7 +119,7 @@ def readings(calibration: Calibration, j: int) -> bytes:
     """Readings of IMU j under what the trajectory says they should be, where it moves most, as [S20] Figure 1."""
     imu, record = calibration.imus[j], calibration.recording.imus[j]
     both = imu.gyroscope.used & imu.accelerometer.used
-    t = ((record.time_ns - record.time_ns[0]).double() * _NS)[both]
+    t = ((record.time_ns - record.time_ns[0]).double() * NANOSECOND)[both]
     begin = _liveliest(t.numpy(), record.accelerometer[both].numpy())
     shown = (t >= begin) & (t <= begin + _EXCERPT)
     predicted = ImuReading(_predicted(imu.gyroscope, record.gyroscope, both, shown),
@@ -143,7 +143,7 @@ def motion(calibration: Calibration) -> bytes:
         state = calibration.trajectory.kinematics(t)
     assert state.position is not None
     assert state.angular_velocity is not None
-    seconds = ((t - calibration.recording.start_ns).double() * _NS).numpy()
+    seconds = ((t - calibration.recording.start_ns).double() * NANOSECOND).numpy()
     figure, all_axes = _figure(1, 3, (11, 3.2))
     for axes, values, title in (
         (all_axes[0, 0], state.position, "position on the board [m]"),

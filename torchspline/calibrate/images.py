@@ -23,10 +23,10 @@ from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.so3 import rotate
 from torchspline.arithmetic.vector import Vector, cross, negate
 from torchspline.fit.losses import Loss
-from torchspline.fit.model import Model, State
-from torchspline.fit.residual import POSE_IN_BODY, Argument, Clock, Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Argument, Clock, Cotangents, Given, Moment, Residual, Slot
 from torchspline.fit.residuals.reprojection import ReprojectionEquidistant, ReprojectionRadtan
-from torchspline.fit.terms import Differential, Kernel, Places, Term
+from torchspline.fit.solving.model import Model, State
+from torchspline.fit.solving.terms import Differential, Kernel, Places, Term
 from torchspline.fit.variables import Variable
 from torchspline.groups import SE3
 from torchspline.groups.components import join, split
@@ -54,7 +54,7 @@ _TOGETHER = (
 
 @dataclass
 class _ImageKernel:
-    """See `fit.terms.Kernel`."""
+    """See `fit.solving.terms.Kernel`."""
 
     order: list[str]
     rows: int
@@ -241,18 +241,13 @@ class ImageBlock(Residual):
         self.count = count
 
     def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
     ) -> Vector:
         raise NotImplementedError(_TOGETHER)
 
     def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+    ) -> tuple[list[Moment], Cotangents]:
         raise NotImplementedError(_TOGETHER)
 
     def __repr__(self) -> str:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import RotationSpline
 from torch import Tensor
 
 from torchspline.calibrate.images import PROJECTIONS, ImageBlock
@@ -19,10 +19,11 @@ from torchspline.fit.residual import Clock, Residual
 from torchspline.fit.residuals import Accelerometer, Gyroscope
 from torchspline.fit.variables import Variable
 from torchspline.groups import R3, SE3, SO3, Group
+from torchspline.groups.convert import from_scipy, to_scipy
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
+from torchspline.units import SECOND
 
-NS = 1_000_000_000
 #: Trajectories by representation.
 GROUPS = {"split": "R3xSO3", "joint": "SE3"}
 #: What may be estimated besides trajectory, extrinsics, gravity and biases.
@@ -116,9 +117,9 @@ def build(recording: Recording, start: Start, options: Options) -> Layout:
 
 def span(recording: Recording, start: Start) -> tuple[int, int]:
     """First and last nanosecond, on the clock of the first IMU, at which it and a camera measured."""
-    imu, pad = recording.imus[0], round(_PAD * NS)
+    imu, pad = recording.imus[0], round(_PAD * SECOND)
     stamps = [
-        (int(c.t_ns[0]) + round(offset * NS), int(c.t_ns[-1]) + round(offset * NS))
+        (int(c.t_ns[0]) + round(offset * SECOND), int(c.t_ns[-1]) + round(offset * SECOND))
         for c, offset in zip(recording.corners, start.time_offset.tolist(), strict=True)
         if len(c.t_ns)
     ]
@@ -137,16 +138,16 @@ def span(recording: Recording, start: Start) -> tuple[int, int]:
 
 def _trajectory(recording: Recording, start: Start, options: Options) -> BSpline:
     first, last = span(recording, start)
-    dt = max(round(options.spacing * NS), 1)
+    dt = max(round(options.spacing * SECOND), 1)
     segments = (last - first) // dt
     if segments < 1:
         raise ValueError(
-            f"spacing: expected less than the {(last - first) / NS:g} s that sensors share, got {options.spacing:g}"
+            f"spacing: expected less than the {(last - first) / SECOND:g} s that sensors share, got {options.spacing:g}"
         )
     _check_gaps(recording.imus[0], first, first + segments * dt, options)
     count = segments + options.order - 1
-    t = (np.arange(count) - 0.5 * (options.order - 2)) * (dt / NS)
-    known = (start.t_ns - first).numpy() / NS
+    t = (np.arange(count) - 0.5 * (options.order - 2)) * (dt / SECOND)
+    known = (start.t_ns - first).numpy() / SECOND
     points = _through(known, start.T_board_imu.numpy(), np.clip(t, known[0], known[-1]))
     group = Group(GROUPS[options.representation])
     return BSpline(
@@ -159,26 +160,26 @@ def _through(t: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:
     if len(t) == 1:
         return np.repeat(poses, len(at), axis=0)
     position = CubicSpline(t, poses[:, :3])(at)
-    rotation = RotationSpline(t, Rotation.from_quat(poses[:, 3:], scalar_first=True))(at)
-    return np.concatenate([position, rotation.as_quat(scalar_first=True)], axis=1)
+    rotation = RotationSpline(t, to_scipy(torch.from_numpy(poses[:, 3:])))(at)
+    return np.concatenate([position, from_scipy(rotation).numpy()], axis=1)
 
 
 def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None:
     """Control points that no reading touches would be left open."""
     stamps = imu.window(first, last).time_ns
-    rate = (len(stamps) - 1) / max((last - first) / NS, 1e-9)
+    rate = (len(stamps) - 1) / max((last - first) / SECOND, 1e-9)
     if rate * options.spacing < 0.999:
         raise ValueError(
             f"spacing: expected at least the {1 / max(rate, 1e-9):.4g} s between readings of the IMU, got "
             f"{options.spacing:g}: every control point needs a reading"
         )
     steps = stamps.diff()
-    widest = (options.order - 1) * round(options.spacing * NS)
+    widest = (options.order - 1) * round(options.spacing * SECOND)
     if len(steps) and int(steps.max()) > widest:
         row = int(steps.argmax())
         raise ValueError(
-            f"{imu.source or 'imus[0]'}: expected readings at most {widest / NS:g} s apart for a spline of order "
-            f"{options.order} with knots every {options.spacing:g} s; got a gap of {int(steps[row]) / NS:.3f} s at "
+            f"{imu.source or 'imus[0]'}: expected readings at most {widest / SECOND:g} s apart for a spline of order "
+            f"{options.order} with knots every {options.spacing:g} s; got a gap of {int(steps[row]) / SECOND:.3f} s at "
             f"{int(stamps[row])} ns; use a larger spacing, or a part of the recording without the gap"
         )
 
@@ -189,14 +190,14 @@ def _check_gaps(imu: ImuRecord, first: int, last: int, options: Options) -> None
 def _add_imu(layout: Layout, recording: Recording, i: int, start: Start, options: Options) -> None:
     record, noise = recording.imus[i], recording.noise[i]
     first, last = layout.trajectory.domain
-    shift = round(float(start.imu_time_offset[i]) * NS)
+    shift = round(float(start.imu_time_offset[i]) * SECOND)
     inside = (record.time_ns - shift >= first) & (record.time_ns - shift <= last)
     part = record.window(int(first) + shift, int(last) + shift)
     if len(part) < 2:
         raise ValueError(
             f"{record.source or f'imus[{i}]'}: expected readings while cameras saw the board, got none"
         )
-    rate = math.sqrt((len(part) - 1) * NS / int(part.time_ns[-1] - part.time_ns[0]))
+    rate = math.sqrt((len(part) - 1) * SECOND / int(part.time_ns[-1] - part.time_ns[0]))
     mount: dict[str, Variable] = {}
     clock = ahead = None
     if i > 0:
@@ -260,7 +261,7 @@ def _bias(
     first, last = trajectory.domain
     first, last = min(int(first), int(stamps[0])), max(int(last), int(stamps[-1]))
     # Whole segments: a last one with a few readings only would leave its control point open.
-    segments, order = max(1, round((last - first) / (options.bias_spacing * NS))), 4
+    segments, order = max(1, round((last - first) / (options.bias_spacing * SECOND))), 4
     dt, count = -(-(last - first) // segments), segments + order - 1
     points = value.repeat(count, 1)
     return BSpline(points, group=R3, order=order, dt_ns=dt, t0_ns=first, learnable=False)
@@ -271,7 +272,7 @@ def _add_camera(layout: Layout, recording: Recording, i: int, start: Start, opti
     number, name = f"cam{i}", f"cam{i} corners"
     offset = float(start.time_offset[i])
     first, last = layout.trajectory.domain
-    near = corners.t_ns + round(offset * NS)
+    near = corners.t_ns + round(offset * SECOND)
     images = (near >= first) & (near <= last)
     kept = images[corners.frame]
     if not bool(kept.any()):

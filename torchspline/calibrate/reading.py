@@ -48,7 +48,8 @@ def read_recording(config: Path_, corners: Sequence[Path_], imus: Sequence[Path_
     Args:
         config: YAML file with a section `cam0`, `cam1`, ... for each camera (camera_model, intrinsics,
             distortion_model, distortion_coeffs, resolution, as Kalibr writes them, or proj_model, proj_params,
-            dist_model, dist_params), a section `imu0`, ... for each IMU (gyroscope_noise_density and so on, or
+            dist_model, dist_params; timeshift_cam_imu [s], t_imu = t_cam + timeshift_cam_imu, if something is known of
+            the clocks), a section `imu0`, ... for each IMU (gyroscope_noise_density and so on, or
             sigma_g_c, sigma_a_c, sigma_gw_c, sigma_aw_c; g, the magnitude of gravity), and, if the corners are to be
             checked against it, `calib_target` (target_type aprilgrid, tag_rows, tag_cols, tag_size, tag_spacing).
         corners: one npz archive for each camera: t_ns (F,), and a row for each corner, `frame tag_id corner` (C,),
@@ -76,7 +77,11 @@ def read_recording(config: Path_, corners: Sequence[Path_], imus: Sequence[Path_
         for found in seen:
             _check_board(path, content["calib_target"], found)
     gravity = {"gravity": gravities.pop()} if gravities else {}
-    return Recording(tuple(cameras), tuple(seen), tuple(read_imu(x) for x in imus), tuple(noises), **gravity)
+    offsets = tuple(_section(path, content, "cam", i, _time_offset) for i in range(len(corners)))
+    return Recording(
+        tuple(cameras), tuple(seen), tuple(read_imu(x) for x in imus), tuple(noises),
+        time_offset=offsets if any(x is not None for x in offsets) else None, **gravity,
+    )  # fmt: skip
 
 
 def read_corners(path: Path_) -> Corners:
@@ -139,6 +144,12 @@ def _section(path: Path, content: Mapping[str, Any], kind: str, i: int, parse: A
         return parse(section, name)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {name}: {short(error, 500)}") from None
+
+
+def _time_offset(section: Mapping[str, Any], name: str) -> float | None:
+    """What Kalibr found: `t_imu = t_cam + timeshift_cam_imu`, as here."""
+    key = "timeshift_cam_imu"
+    return checks.finite_number(key, number(key, section[key])) if key in section else None
 
 
 def _noise(section: Mapping[str, Any], name: str) -> ImuNoise:

@@ -12,12 +12,12 @@ from torchspline import checks
 from torchspline.imu.parameters import ImuNoise
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
+from torchspline.units import SECOND
 
 #: Corners may lie as far outside of the image (px) as sub-pixel refinement may put them.
 _BEYOND = 2.0
 #: The board lies in its plane z = 0 up to this (m).
 _FLAT = 1e-6
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,8 @@ class Recording:
         imus: readings of each IMU, stamps ascending, numbers finite. May be empty.
         noise: of each IMU, numbers for all three axes; densities above zero.
         gravity: magnitude of the gravitational acceleration, m/s^2.
+        time_offset: of each camera what is known of it beforehand, s, or None; where a calibration starts, and where it
+            stays if it is not to estimate offsets.
     Raises:
         TypeError, ValueError: a wrong type, no camera, numbers of cameras and corners or of IMUs and noises that
         differ, corners outside of the image, readings that are not in order of time or not finite.
@@ -120,6 +122,7 @@ class Recording:
     imus: tuple[ImuRecord, ...]
     noise: tuple[ImuNoise, ...]
     gravity: float = 9.80665
+    time_offset: tuple[float | None, ...] | None = None
 
     def __post_init__(self) -> None:
         for name, kind in (
@@ -136,6 +139,9 @@ class Recording:
             if first != second:
                 raise ValueError(f"{b}: expected one for each of the {first} {a}, got {second}")
         checks.positive("gravity", self.gravity)
+        if self.time_offset is not None:
+            _check_offsets(self.time_offset, len(self.cameras))
+            object.__setattr__(self, "time_offset", tuple(self.time_offset))
         for i, noise in enumerate(self.noise):
             for sensor in ("gyroscope", "accelerometer"):
                 density, walk = f"{sensor}_noise_density", f"{sensor}_random_walk"
@@ -162,15 +168,19 @@ class Recording:
     def between(self, start: float, end: float) -> "Recording":
         """What was stamped from `start` to `end`, seconds since `start_ns`, both included, whatever the clock.
 
+        Of IMUs from known time offsets earlier to later.
+
         Raises:
             TypeError, ValueError: no finite numbers, an end before the start.
         """
         checks.finite_number("start", start)
         if checks.finite_number("end", end) < start:
             raise ValueError(f"end: expected a time after start = {start:g} s, got {end:g}")
-        low, high = self.start_ns + round(start * _NS), self.start_ns + round(end * _NS)
+        low, high = self.start_ns + round(start * SECOND), self.start_ns + round(end * SECOND)
         corners = tuple(c.select((c.t_ns >= low) & (c.t_ns <= high)) for c in self.corners)
-        return replace(self, corners=corners, imus=tuple(x.window(low, high) for x in self.imus))
+        known = [round(x * SECOND) for x in self.time_offset or () if x is not None] or [0]
+        imus = tuple(x.window(low + min(known), high + max(known)) for x in self.imus)
+        return replace(self, corners=corners, imus=imus)
 
     def only(self, *cameras: int) -> "Recording":
         """The same with these cameras, numbered from 0, in this order.
@@ -188,7 +198,20 @@ class Recording:
             self,
             cameras=tuple(self.cameras[i] for i in cameras),
             corners=tuple(self.corners[i] for i in cameras),
+            time_offset=None if self.time_offset is None else tuple(self.time_offset[i] for i in cameras),
         )
+
+
+def _check_offsets(offsets: Any, count: int) -> None:
+    if isinstance(offsets, (str, Tensor)) or not isinstance(offsets, Sequence):
+        raise TypeError(
+            f"time_offset: expected a tuple of numbers or None, one a camera, got {type(offsets).__name__}"
+        )
+    if len(offsets) != count:
+        raise ValueError(f"time_offset: expected one for each of the {count} cameras, got {len(offsets)}")
+    for i, x in enumerate(offsets):
+        if x is not None:
+            checks.finite_number(f"time_offset[{i}]", x)
 
 
 def _all(name: str, x: Any, kind: type) -> tuple:

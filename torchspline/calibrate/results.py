@@ -15,7 +15,9 @@ from torchspline.calibrate.coverage import Coverage, coverage
 from torchspline.calibrate.estimate import CalibratedImu, Calibration, SensorResiduals
 from torchspline.calibrate.report import CONVENTIONS, page, sensors
 from torchspline.groups.group import SE3
+from torchspline.io.archive import write_bytes
 from torchspline.io.camchain import CamChain, write_camchain
+from torchspline.units import NANOSECOND
 
 #: The files that `write_calibration` writes.
 FILES = ("result.json", "camchain-imucam.yaml", "report.html")
@@ -46,9 +48,9 @@ def write_calibration(folder: str | PathLike[str], calibration: Calibration) -> 
     folder.mkdir(parents=True, exist_ok=True)
     found = coverage(calibration)
     content = json.dumps(_plain(results(calibration, found)), indent=2, allow_nan=False)
-    (folder / FILES[0]).write_text(content + "\n", encoding="utf-8")
+    write_bytes(folder / FILES[0], (content + "\n").encode())
     write_camchain(folder / FILES[1], camchain(calibration))
-    (folder / FILES[2]).write_text(page(calibration, found), encoding="utf-8")
+    write_bytes(folder / FILES[2], page(calibration, found).encode())
     return found.warnings
 
 
@@ -103,7 +105,7 @@ def results(calibration: Calibration, found: Coverage) -> dict[str, Any]:
         "trajectory": {
             "group": str(options.group),
             "order": options.order,
-            "spacing_s": None if options.dt_ns is None else options.dt_ns * 1e-9,
+            "spacing_s": None if options.dt_ns is None else options.dt_ns * NANOSECOND,
             "control_points": options.control_points.shape[-2],
         },
         "solver": {

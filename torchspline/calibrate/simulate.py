@@ -10,15 +10,16 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.calibrate.images import PROJECTIONS
 from torchspline.calibrate.recording import Corners, Recording
-from torchspline.fit.kernel import kernel_of
+from torchspline.fit.solving.kernel import kernel_of
 from torchspline.groups import SE3, Group
+from torchspline.groups.convert import from_scipy
 from torchspline.imu import ImuNoise, measure
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
+from torchspline.units import SECOND
 
 GROUPS = {"split": "R3xSO3", "joint": "SE3"}
-_NS = 1_000_000_000
 #: The board: 6 x 6 tags of 88 mm, 26.4 mm apart, four corners each.
 _TAGS, _TAG, _GAP = 6, 0.088, 0.0264
 
@@ -91,13 +92,13 @@ def simulate(
     T_imu_cam, offsets = _mounting(cameras)
     gravity = _vector(0.0, -9.80665, 0.0)
     biases = _vector(-0.002, 0.02, 0.078), _vector(0.05, -0.12, 0.08)
-    start, dt = 1_000 * _NS, round(spacing * _NS)
+    start, dt = 1_000 * SECOND, round(spacing * SECOND)
     trajectory = _trajectory(seconds, order, dt, start, representation, T_imu_cam[0])
 
     span = trajectory.domain[1] - start
     stamps = start + torch.linspace(0, 1, samples, dtype=torch.float64).mul(span).round().long()
     clean = measure(trajectory, stamps, gravity, *biases)
-    rate = np.sqrt((samples - 1) / (span / _NS)) if samples > 1 else 1.0
+    rate = np.sqrt((samples - 1) / (span / SECOND)) if samples > 1 else 1.0
 
     def noisy(x: Tensor, sigma: float) -> Tensor:
         return x + sigma * torch.randn(x.shape, generator=generator, dtype=torch.float64)
@@ -109,7 +110,7 @@ def simulate(
         source="simulated",
     )
     # Images keep away from the ends by more than the offsets, so that none of them leaves the trajectory.
-    edge = 0.02 * _NS
+    edge = 0.02 * SECOND
     times = (
         start + (edge + torch.linspace(0, 1, images, dtype=torch.float64) * (span - 2 * edge)).round().long()
     )
@@ -133,7 +134,7 @@ def _mounting(cameras: int) -> tuple[Tensor, Tensor]:
     for i in range(cameras):
         rotation = turn * Rotation.from_rotvec([0.002 * i, 0.01 * i, -0.004 * i])
         position = turn.apply([0.11 * i, 0.0005 * i, -0.001 * i]) + np.array([-0.0216, -0.0647, 0.0098])
-        poses.append([*position, *rotation.as_quat(scalar_first=True)])
+        poses.append([*position, *from_scipy(rotation).tolist()])
     return torch.tensor(poses, dtype=torch.float64), torch.linspace(0.0041, 0.0046, cameras).double()
 
 
@@ -141,8 +142,8 @@ def _trajectory(
     seconds: float, order: int, dt: int, start: int, representation: str, T_imu_cam: Tensor
 ) -> BSpline:
     """Control points on waves of the first camera before the board, which it faces."""
-    count = round(seconds * _NS / dt) + order - 1
-    t = (np.arange(count) - 0.5 * (order - 2)) * (dt / _NS)
+    count = round(seconds * SECOND / dt) + order - 1
+    t = (np.arange(count) - 0.5 * (order - 2)) * (dt / SECOND)
     periods = np.array([[1.31, 2.9], [1.07, 3.7], [1.53, 4.3]])
     heights = np.array([[0.055, 0.10], [0.050, 0.09], [0.045, 0.08]])
     turns = np.array([[0.16, 0.22], [0.17, 0.20], [0.22, 0.30]])
@@ -154,8 +155,8 @@ def _trajectory(
     # Looking down at the board: x to its right, y down, z away from whoever looks.
     facing = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     rotation = facing * Rotation.from_rotvec((turns * beats).sum(-1))
-    camera = np.concatenate([position, rotation.as_quat(scalar_first=True)], axis=1)
-    imu = SE3.compose(torch.from_numpy(camera), SE3.inverse(T_imu_cam))
+    camera = torch.cat([torch.from_numpy(position), from_scipy(rotation)], dim=1)
+    imu = SE3.compose(camera, SE3.inverse(T_imu_cam))
     group = Group(GROUPS[representation])
     return BSpline(imu, group=group, order=order, dt_ns=dt, t0_ns=start, learnable=False)
 
@@ -176,7 +177,7 @@ def _sights(trajectory: BSpline, t: Tensor, T: Tensor, offset: float, camera: Ca
     xy = torch.stack([x.reshape(-1), y.reshape(-1)], -1)[:, None] + size
     board = torch.nn.functional.pad(xy.reshape(-1, 2), (0, 1))
     frame, which = torch.arange(len(t)).repeat_interleave(len(board)), torch.arange(len(board)).repeat(len(t))
-    poses = trajectory(t + round(offset * _NS))
+    poses = trajectory(t + round(offset * SECOND))
     kernel = kernel_of(
         PROJECTIONS[camera.distortion],
         trajectory.group.name,

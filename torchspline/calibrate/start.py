@@ -1,7 +1,7 @@
 """Where a calibration starts, from nothing but the recording: no extrinsics, offsets or gravity given by hand."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -18,9 +18,9 @@ from torchspline.groups.group import SE3
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
+from torchspline.units import SECOND
 
 Array = NDArray[Any]
-_NS = 1_000_000_000
 #: Fewest images with a board pose, and the largest share of images with corners that may contradict the board.
 _FEWEST_IMAGES, _MOST_MISFITS = 20, 0.3
 #: Share of corners far off in good images that is worth a note.
@@ -87,7 +87,8 @@ def find_start(recording: Recording, *, max_offset: float | None = 10.0) -> Star
 
     Args:
         recording: with at least one camera and one IMU.
-        max_offset: how far the clocks of cameras and IMUs may be apart, s; None for any distance at which they overlap.
+        max_offset: how far the clocks of cameras and IMUs may be apart, s, beyond time offsets that the recording
+            knows; None for any distance at which they overlap.
     Returns:
         Start.
     Raises:
@@ -132,6 +133,15 @@ def find_start(recording: Recording, *, max_offset: float | None = 10.0) -> Star
         boards=boards,
         notes=notes,
     )
+
+
+def with_known_offsets(start: Start, recording: Recording) -> Start:
+    """A start with the time offsets that the recording knows, for where they shall stay."""
+    if recording.time_offset is None:
+        return start
+    found = start.time_offset.tolist()
+    offsets = [y if x is None else x for x, y in zip(recording.time_offset, found, strict=True)]
+    return replace(start, time_offset=torch.tensor(offsets, dtype=torch.float64))
 
 
 def _known(x: Tensor | None) -> Tensor:
@@ -245,7 +255,7 @@ def _swapped(recording: Recording, boards: tuple[BoardPoses, ...]) -> str:
 def _spline(recording: Recording, i: int, board: BoardPoses, notes: list[str]) -> BSpline:
     """Through the poses of the camera on the board, those that stray far from it left out."""
     t, poses = board.t_ns[board.good], SE3.inverse(board.T_cam_board[board.good])
-    dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / _NS, _SHORTEST_KNOT)
+    dt = max(_KNOT_INTERVALS * float(t.diff().to(torch.float64).median()) / SECOND, _SHORTEST_KNOT)
 
     def fit(t: Tensor, poses: Tensor) -> Any:
         options: dict[str, Any] = {"smoothness": _SMOOTHNESS, "max_iterations": 10, "tolerance": 1e-4}
@@ -270,6 +280,9 @@ def _aligned(
     """Camera i with IMU j."""
     names = f"{recording.cameras[i].name} with imu{j}"
     imu = _thinned(recording.imus[j], recording.corners[i])
+    # IMUs share a clock more likely than not: what is known of the first is where the search begins for all.
+    known = (recording.time_offset and recording.time_offset[i]) or 0.0
+    imu = replace(imu, time_ns=imu.time_ns - round(known * SECOND))
     length = float(imu.accelerometer.norm(dim=1).median()) if len(imu) else recording.gravity
     if not _AROUND_GRAVITY[0] <= length / recording.gravity <= _AROUND_GRAVITY[1]:
         raise ValueError(
@@ -288,6 +301,7 @@ def _aligned(
         )
     except ValueError as error:
         raise ValueError(f"{names}: {error}") from None
+    found = replace(found, time_offset=found.time_offset + known)
     turns = _explained(imu.gyroscope, found.gyro_rms)
     force, miss = _explained(imu.accelerometer, found.accel_rms or 0.0), found.accel_rms or 0.0
     if turns < _TURNS_EXPLAINED:
@@ -302,7 +316,7 @@ def _aligned(
         )
     # Readings far off are the rule here: the first spline is too stiff for the fastest motion.
     notes += [f"{names}: {note}" for note in found.notes if "standard deviations off" not in note]
-    if abs(found.time_offset) > _APART:
+    if abs(found.time_offset - known) > _APART:
         notes.append(
             f"{names}: the clocks are {found.time_offset:.3f} s apart (t_imu = t_cam + {found.time_offset:.3f} s)"
         )
@@ -366,5 +380,5 @@ def _poses(
 
 
 def _of_imu(board: BoardPoses, T_cam_imu: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    t = board.t_ns[board.good] + round(float(offset) * _NS)
+    t = board.t_ns[board.good] + round(float(offset) * SECOND)
     return t, SE3.compose(SE3.inverse(board.T_cam_board[board.good]), T_cam_imu)

@@ -1,11 +1,13 @@
 """The command line. `COMMANDS` lists the commands; a new one is a module beside this one and a line in it."""
 
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import NamedTuple
 
-from torchspline.cli.arguments import Mistake, parse
+from torchspline.cli.arguments import STATUS, Mistake, parse
 from torchspline.cli.report import Report
 
 
@@ -35,7 +37,7 @@ COMMANDS: dict[str, Command] = {
     "bench": Command(f"{_HERE}.bench", "bench", "how long the main calls take on this machine"),
     "view": Command(f"{_HERE}.view", "view", "a page with an interactive 3D view of a file"),
     "explore": Command(f"{_HERE}.explore", "explore", "compare interpolation methods in the browser"),
-    "convert": Command(f"{_HERE}.convert", "convert", "between file formats of poses"),
+    "convert": Command(f"{_HERE}.convert", "convert", "between file formats of poses and IMU readings"),
     "info": Command(f"{_HERE}.info", "info", "what is in a file"),
     "kernels show": Command(f"{_HERE}.kernels", "show", "the source of a compiled loop"),
 }
@@ -43,12 +45,25 @@ _EXPECTED = (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `torchspline` command. Exits with 0, with 1 if a check failed, with 2 on bad input."""
+    """Entry point of the `torchspline` command: exits with what `run` returns."""
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
 def run(words: Sequence[str]) -> int:
-    """Run the command that `words` say and return its exit status."""
+    """Run the command that `words` say and return its exit status: 0, 1 if a check failed, 2 on bad input, 130."""
+    try:
+        status = _run(words)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # whoever read has enough; what is left goes nowhere
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except KeyboardInterrupt:
+        return 130
+
+
+def _run(words: Sequence[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(_overview())
         return 0 if words else 2
@@ -80,12 +95,10 @@ def run(words: Sequence[str]) -> int:
         return 0 if found.passed else 1
     except Mistake as mistake:
         return _refuse(f"{mistake} (torchspline {name} --help says more)")
+    except BrokenPipeError:
+        raise
     except _EXPECTED as error:
         return _refuse(str(error) or type(error).__name__)
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        return 0
 
 
 def _refuse(message: str) -> int:
@@ -105,6 +118,6 @@ def _overview(names: Sequence[str] = tuple(COMMANDS)) -> str:
             *lines,
             "",
             "torchspline COMMAND --help shows arguments and examples; --json makes a command print one line of JSON.",
-            "Exit status: 0 all is well, 1 a check failed, 2 bad input.",
+            f"E{STATUS[1:]}.",
         ]
     )

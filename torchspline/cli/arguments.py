@@ -6,6 +6,8 @@ from functools import partial
 from typing import Any, get_args, get_origin, get_type_hints
 
 _NONE = inspect.Parameter.empty
+#: The same for all commands.
+STATUS = "exit status: 0 all is well, 1 a check failed, 2 bad input or a file that cannot be written, 130 interrupted"
 
 
 class Mistake(ValueError):
@@ -17,9 +19,10 @@ def parse(
 ) -> tuple[Callable[[], Any], bool]:
     """The call that `words` ask for, and whether they ask for JSON.
 
-    Parameters without a default are positional, in order, unless some are keyword-only; all others are options. Lists
-    take several words, truth values may stand alone, hyphens do for underscores. `--config FILE` reads options from
-    YAML and `--json` asks for JSON, unless the function has a parameter of that name.
+    Parameters without a default are positional, in order, unless some are keyword-only; all others are options, of
+    which one that stands before keyword-only ones may be the first word, without its name. Lists take several words,
+    truth values may stand alone, hyphens do for underscores. `--config FILE` reads options from YAML and `--json` asks
+    for JSON, unless the function has a parameter of that name.
 
     Raises:
         Mistake: words that do not fit.
@@ -38,7 +41,7 @@ def parse(
     parser = ArgumentParser(
         prog=program,
         description=docstring.short_description,
-        epilog=f"examples:\n{_indented(examples)}" if examples else None,
+        epilog=f"examples:\n{_indented(examples)}\n\n{STATUS}" if examples else STATUS,
         formatter_class=Formatter,
         exit_on_error=False,
     )
@@ -57,6 +60,9 @@ def parse(
         )  # fmt: skip
     named = any(x.kind is inspect.Parameter.KEYWORD_ONLY for x in parameters.values())
     parser.add_function_arguments(function, as_group=False, as_positional=not named, skip=set(lists))
+    first = next((x.name for x in parameters.values() if x.kind is x.POSITIONAL_OR_KEYWORD), None)
+    if named and first and words and not words[0].startswith("-"):
+        words = [f"--{first}={words[0]}", *words[1:]]
     switches = {name for name in parameters if hints.get(name) is bool}
     try:
         chosen = parser.parse_args(_spelled_out(words, switches, {*parameters, "config"}))

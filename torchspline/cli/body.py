@@ -1,18 +1,18 @@
 """`torchspline body`: IMUs on every joint of a captured motion."""
 
-import json
 import math
 import re
 from pathlib import Path
 
 import torch
 
-from torchspline.cli.common import NS
+from torchspline.cli.common import save_figure, write_report
 from torchspline.cli.report import Report
 from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, read_bvh, write_imu
 from torchspline.people import fit_body, response
 from torchspline.plot import imu_comparison
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline body walk.bvh --rate 200 --out DIR
@@ -59,7 +59,7 @@ def body(
         made = measure(fitted, times, gravity)
     kept = response(torch.tensor([0.5 * bandwidth, bandwidth]).double(), frames, bandwidth=bandwidth)
     out.mkdir(parents=True, exist_ok=True)
-    stamps = (times * NS).round().to(torch.int64)
+    stamps = (times * SECOND).round().to(torch.int64)
     rows = []
     report = {}
     for j, name in enumerate(skeleton.names):
@@ -71,12 +71,12 @@ def body(
         report[name] = {"file": file, "gyroscope_rms_rad_s": rms[0], "accelerometer_rms_m_s2": rms[1]}
     first = ImuReading(made.gyroscope[0], made.accelerometer[0])
     figure = imu_comparison((times, first), title=f"{motion.name}: IMU on {skeleton.names[0]}")
-    figure.savefig(out / "imu.png", dpi=130)
+    save_figure(out / "imu.png", figure)
     summary = {
         "frames": len(t), "frame_rate_hz": frames, "bandwidth_hz": bandwidth, "rate_hz": rate,
         "acceleration_kept_at_half_and_full_bandwidth": kept.gain.tolist(), "joints": report,
     }  # fmt: skip
-    (out / "report.json").write_text(json.dumps(summary, indent=2) + "\n")
+    write_report(out / "report.json", summary)
     notes = [
         f"{len(t)} frames at {frames:.4g} Hz, {len(times)} readings a joint at {rate:g} Hz; of accelerations at "
         f"{bandwidth:g} Hz {100 * float(kept.gain[1]):.1f} % are kept"

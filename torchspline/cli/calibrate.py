@@ -10,7 +10,8 @@ from typing import Literal
 from torchspline.calibrate.estimate import Calibration, calibrate
 from torchspline.calibrate.reading import read_recording
 from torchspline.calibrate.results import FILES, write_calibration
-from torchspline.calibrate.start import find_start
+from torchspline.calibrate.start import find_start, with_known_offsets
+from torchspline.cli.common import MOST_SECONDS
 from torchspline.cli.report import Report
 
 EXAMPLES = """
@@ -52,17 +53,18 @@ def camera_imu(
         estimate_intrinsics: of every camera, along with the rest; otherwise those of the config are kept.
         estimate_line_delay: of rolling shutters.
         estimate_imu_scaling: scale and misalignment of the axes of gyroscopes and accelerometers.
-        synchronised: cameras and the first IMU share one clock, and no time offset is to be estimated.
+        synchronised: cameras and the first IMU share one clock, or are apart by the timeshift_cam_imu of the config,
+            and no time offset is to be estimated.
         bias_spacing: knot spacing of biases that change over time, s; constant by default.
         pixel_sigma: standard deviation of a coordinate of a corner, px.
         reweigh: weight each sensor by what its residuals turn out to be, so that standard deviations are realistic.
-        max_offset: how far the clocks may be apart, s.
+        max_offset: how far the clocks may be apart, s, beyond a timeshift_cam_imu of the config.
         start: seconds after the first image at which to begin.
         duration: how much of the recording to use, s.
     """
     if not (math.isfinite(spacing) and spacing > 0):
         raise ValueError(f"spacing: expected a finite number above zero (ms), got {spacing}")
-    if not (math.isfinite(start) and start >= 0):
+    if not 0 <= start < MOST_SECONDS:
         raise ValueError(f"start: expected seconds, zero or more, got {start}")
     if not duration > 0:
         raise ValueError(f"duration: expected seconds above zero, got {duration}")
@@ -76,8 +78,13 @@ def camera_imu(
         "line_delay": estimate_line_delay,
         "imu_scaling": estimate_imu_scaling,
     }
+    if synchronised:
+        known = recording.time_offset or (None,) * len(recording.cameras)
+        recording = replace(recording, time_offset=tuple(x or 0.0 for x in known))
     begin = perf_counter()
     first = find_start(recording, max_offset=max_offset)
+    if synchronised:
+        first = with_known_offsets(first, recording)
     found_after = perf_counter() - begin
     found = calibrate(
         recording,

@@ -1,24 +1,29 @@
 """What several commands do."""
 
+import json
 import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchspline.fit import PoseFit
 from torchspline.imu import ImuReading
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
+from torchspline.io.archive import replacing, write_bytes
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
-NS = 1_000_000_000
+#: Longer than any recording, s: stamps are 64 bits of nanoseconds.
+MOST_SECONDS = 9e9
 
 
 def longest_stretch(record: PoseRecord, gap: float | None, start: float, duration: float) -> PoseRecord:
     """The longest run of usable poses without a larger gap, cut to `start` and `duration`."""
-    usable = ~(record.position.isnan().any(-1) | record.rotation.isnan().any(-1))
+    usable = record.position.isfinite().all(-1) & record.rotation.isfinite().all(-1)
     rows = torch.argsort(record.time_ns, stable=True)
     rows = rows[usable[rows]]
     record = PoseRecord(record.time_ns[rows], record.position[rows], record.rotation[rows], record.source)
@@ -29,17 +34,21 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
         )
     steps = time.diff()
     median = steps.to(torch.float64).median().item()
-    largest = max(0.03 * NS, 3 * median) if gap is None else gap * 1e6
+    if gap is not None and not gap > 0:
+        raise ValueError(f"gap: expected milliseconds above zero, got {gap}")
+    largest = max(0.03 * SECOND, 3 * median) if gap is None else gap * 1e6
     edges = [0, *(torch.nonzero(steps > largest).flatten() + 1).tolist(), len(time)]
     low, high = max(
         ((int(time[a]), int(time[b - 1])) for a, b in pairwise(edges)),
         key=lambda stretch: stretch[1] - stretch[0],
     )
-    if not (math.isfinite(start) and start >= 0):
+    if not 0 <= start < MOST_SECONDS:
         raise ValueError(f"start: expected seconds, zero or more, got {start}")
-    low += round(start * NS)
-    if math.isfinite(duration):
-        high = min(high, low + round(duration * NS))
+    if not duration > 0:
+        raise ValueError(f"duration: expected seconds above zero, got {duration}")
+    low += round(start * SECOND)
+    if duration < MOST_SECONDS:
+        high = min(high, low + round(duration * SECOND))
     if low >= high:
         raise ValueError(
             f"start, duration: nothing is left of the longest stretch without a gap ({start=}, {duration=})"
@@ -49,7 +58,7 @@ def longest_stretch(record: PoseRecord, gap: float | None, start: float, duratio
 
 def excerpt(stamps: Tensor, reading: ImuReading, shown: Tensor, origin: int) -> tuple[Tensor, ImuReading]:
     """Seconds since `origin` and readings of the samples `shown`."""
-    return (stamps[shown] - origin) / NS, ImuReading(*(x[shown] for x in reading))
+    return (stamps[shown] - origin) / SECOND, ImuReading(*(x[shown] for x in reading))
 
 
 def rmse(made: ImuReading, gyroscope: Tensor, accelerometer: Tensor) -> tuple[float, float]:
@@ -84,6 +93,17 @@ def fit_report(fit: PoseFit, dt: float) -> dict[str, Any]:
         "stopped": fit.reason,
         "notes": fit.notes,
     }
+
+
+def save_figure(path: Path, figure: Figure, dpi: int = 130) -> None:
+    """Draw a figure into a file (png, pdf, svg), whole or not at all."""
+    with replacing(path) as part:
+        figure.savefig(part, dpi=dpi, format=path.suffix[1:] or "png")
+
+
+def write_report(path: Path, values: dict[str, Any]) -> None:
+    """What scripts read, as JSON."""
+    write_bytes(path, (json.dumps(values, indent=2) + "\n").encode())
 
 
 def write_results(out: Path, trajectory: Trajectory, stamps: Tensor, made: ImuReading) -> None:

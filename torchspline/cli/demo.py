@@ -1,12 +1,19 @@
 """`torchspline demo`."""
 
-import json
 import math
 from pathlib import Path
 
 import torch
 
-from torchspline.cli.common import NS, excerpt, fit_report, fit_rows, rmse, write_results
+from torchspline.cli.common import (
+    excerpt,
+    fit_report,
+    fit_rows,
+    rmse,
+    save_figure,
+    write_report,
+    write_results,
+)
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.groups import SO3
@@ -14,11 +21,14 @@ from torchspline.imu import ImuReading, measure
 from torchspline.io import ImuRecord, PoseRecord, write_imu, write_poses
 from torchspline.plot import imu_comparison
 from torchspline.splines import SplitBSpline
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline demo
 torchspline demo --duration 60 --seed 3 --out DIR --json
 """
+
+_LONGEST = 1e5  # s, of which there are 12 million poses
 
 
 def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int = 0) -> Report:
@@ -29,13 +39,13 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         duration: length of the motion, s.
         seed: of the random motion and noise.
     """
-    if duration < 2.0:
-        raise ValueError(f"duration: expected at least 2 s, got {duration}")
+    if not 2.0 <= duration <= _LONGEST:
+        raise ValueError(f"duration: expected at least 2 s and at most {_LONGEST:g} s, got {duration}")
     out.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(seed)
     truth = _random_motion(duration, generator)
     position_noise, rotation_noise = 1e-4, 5e-4
-    stamps = torch.arange(0, int(duration * NS), NS // 120)
+    stamps = torch.arange(0, int(duration * SECOND), SECOND // 120)
     exact = truth(stamps)
     noise = torch.randn(len(stamps), 6, generator=generator, dtype=torch.float64)
     rotations = SO3.retract(exact[:, 3:], rotation_noise * noise[:, 3:], side="right")
@@ -43,8 +53,8 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
 
     spacing = 0.1
     fit = fit_poses(stamps, torch.cat([poses.position, poses.rotation], -1), dt=spacing)
-    margin = int(0.3 * NS)
-    times = torch.arange(margin, int(stamps[-1]) - margin, NS // 200)
+    margin = int(0.3 * SECOND)
+    times = torch.arange(margin, int(stamps[-1]) - margin, SECOND // 200)
     with torch.no_grad():
         ideal, made = measure(truth, times), measure(fit.trajectory, times)
     errors = rmse(made, ideal.gyroscope, ideal.accelerometer)
@@ -55,14 +65,14 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
     write_poses(out / "poses.txt", poses)
     write_results(out, fit.trajectory, times, made)
     write_imu(out / "imu_truth.csv", ImuRecord(times, ideal.gyroscope, ideal.accelerometer, "demo"))
-    shown = times < margin + 10 * NS
+    shown = times < margin + 10 * SECOND
     figure = imu_comparison(
         excerpt(times, made, shown, 0),
         excerpt(times[::4], ImuReading(*(x[::4] for x in ideal)), shown[::4], 0),
         "IMU synthesised from noisy poses, and the truth",
         ("synthesised", "truth"),
     )
-    figure.savefig(out / "imu.png", dpi=130)
+    save_figure(out / "imu.png", figure)
 
     rows = [
         ("poses at 120 Hz", str(len(stamps)), ""),
@@ -78,7 +88,7 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         "seed": seed,
         "fit": fit_report(fit, spacing),
     }
-    (out / "report.json").write_text(json.dumps({"passed": passed, **values}, indent=2) + "\n")
+    write_report(out / "report.json", {"passed": passed, **values})
     names = ("poses.txt", "trajectory.txt", "imu.csv", "imu_truth.csv", "imu.png", "report.json")
     notes = [f"check against the truth: {'passed' if passed else 'FAILED'}"]
     return Report("torchspline demo", values, rows, notes, [out / name for name in names], passed)
@@ -94,4 +104,4 @@ def _random_motion(duration: float, generator: torch.Generator) -> SplitBSpline:
     for turn in turns[1:]:
         rotation.append(SO3.retract(rotation[-1], turn, side="right"))
     points = torch.cat([position, torch.stack(rotation)], dim=-1)
-    return SplitBSpline(points, order=order, dt_ns=int(knot * NS), t0_ns=0, learnable=False)
+    return SplitBSpline(points, order=order, dt_ns=int(knot * SECOND), t0_ns=0, learnable=False)

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
+from torchspline.cli.common import save_figure
 from torchspline.cli.report import Report
 from torchspline.explore import METHODS, Explorer
 
@@ -16,8 +17,8 @@ torchspline explore --figure methods.png      # draws the figure and ends
 
 
 def explore(
-    *,
     file: Path | None = None,
+    *,
     keyframes: int = 8,
     methods: list[str] | None = None,
     format: Literal["tum", "euroc", "kitti", "ros"] | None = None,
@@ -33,7 +34,7 @@ def explore(
     Serves a page until it is interrupted (Ctrl-C).
 
     Args:
-        file: poses or a saved trajectory (.npz) to take keyframes from.
+        file: poses or a saved trajectory (.npz) to take keyframes from; may stand alone, as the first word.
         keyframes: how many of them.
         methods: shown at the start; names of interpolate, or "squad on SE3".
         format: of the poses; by default recognised from their content.
@@ -51,7 +52,7 @@ def explore(
         Explorer(methods=chosen) if file is None else Explorer.load(file, keyframes, chosen, format, times)
     )
     if figure is not None:
-        explorer.figure().savefig(figure, dpi=150)
+        save_figure(figure, explorer.figure(), dpi=150)
         _, wrong = explorer.curves()
         return Report(
             "figure", {"methods": chosen, "keyframes": len(explorer.keyframes)},

@@ -1,6 +1,5 @@
 """`torchspline imu`."""
 
-import json
 import math
 from pathlib import Path
 from typing import Literal
@@ -8,16 +7,30 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchspline.cli.common import NS, excerpt, fit_report, fit_rows, longest_stretch, rmse, write_results
+from torchspline.cli.common import (
+    MOST_SECONDS,
+    excerpt,
+    fit_report,
+    fit_rows,
+    longest_stretch,
+    rmse,
+    save_figure,
+    write_report,
+    write_results,
+)
+from torchspline.cli.files import PoseFormat, open_poses, seconds_of
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
-from torchspline.io import ImuRecord, read_imu, read_poses
+from torchspline.io import ImuRecord, read_imu
+from torchspline.io.archive import replacing
 from torchspline.plot import imu_comparison
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline imu poses.txt --rate 200 --out DIR
 torchspline imu mocap0 --recorded imu0 --spacing 80
+torchspline imu drive.bag --topic /odom --recorded drive.bag --recorded-topic /imu/data
 torchspline imu kitti_00.txt --times times.txt --gravity "[0, 9.80665, 0]"
 """
 
@@ -35,14 +48,19 @@ def imu(
     start: float = 0.0,
     duration: float = math.inf,
     margin: float = 0.3,
-    format: Literal["tum", "euroc", "kitti"] | None = None,
+    format: PoseFormat | None = None,
     times: Path | None = None,
+    topic: str | None = None,
+    child: str | None = None,
+    recorded_topic: str | None = None,
 ) -> Report:
     """IMU readings from a file of poses, compared with a recording if there is one.
 
     Args:
-        poses: TUM, EuRoC or KITTI file of poses of the IMU's frame, gzipped or not.
-        recorded: EuRoC IMU file on the same clock. Constant biases are estimated and removed before comparing.
+        poses: TUM, EuRoC, KITTI or nerfstudio file, gzipped or not, or ROS bag: poses of the IMU's frame; - is
+            standard input.
+        recorded: EuRoC IMU file or ROS bag on the same clock. Constant biases are estimated and removed before
+            comparing.
         rate: of the synthesised readings, Hz.
         out: folder for the results; made if it is not there.
         spacing: of the knots, ms; by default five median pose intervals. A wrong one costs accuracy.
@@ -56,17 +74,20 @@ def imu(
         margin: left out at both ends, where a spline knows least, s.
         format: of the poses; by default recognised from their content.
         times: file of times that goes with KITTI poses.
+        topic: of the poses in a ROS bag; needed where it has several.
+        child: frame of the transforms in that topic; needed where it has several.
+        recorded_topic: of the recording in a ROS bag; needed where it has several.
     """
     if not (math.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
-    if not margin >= 0:
+    if not 0 <= margin < MOST_SECONDS:
         raise ValueError(f"margin: expected seconds, zero or more, got {margin}")
-    record = read_poses(poses, format, times)
-    recording = None if recorded is None else read_imu(recorded)
+    record = open_poses(poses, format, times, topic, child)
+    recording = None if recorded is None else read_imu(recorded, topic=recorded_topic)
     record = longest_stretch(record, gap, start, duration)
     out.mkdir(parents=True, exist_ok=True)
-    interval = record.time_ns.unique().diff().to(torch.float64).median().item() / NS
-    dt = 5 * interval if spacing is None else spacing * 1e-3
+    interval = record.time_ns.unique().diff().to(torch.float64).median().item() / SECOND
+    dt = 5 * interval if spacing is None else seconds_of(spacing)
     fit = fit_poses(
         record.time_ns,
         torch.cat([record.position, record.rotation], -1),
@@ -75,26 +96,26 @@ def imu(
         representation=representation,
     )
     first, last = int(record.time_ns[0]), int(record.time_ns[-1])
-    low, high = first + round(margin * NS), last - round(margin * NS)
+    low, high = first + round(margin * SECOND), last - round(margin * SECOND)
     if low >= high:
         raise ValueError(
-            f"margin: nothing is left of {(last - first) / NS:.3g} s between margins of {margin} s"
+            f"margin: nothing is left of {(last - first) / SECOND:.3g} s between margins of {margin} s"
         )
-    if (high - low) / NS * rate > 1e9:
-        raise ValueError(f"rate: {rate:g} Hz over {(high - low) / NS:g} s makes more than 1e9 readings")
-    steps = torch.arange(int((high - low) / NS * rate) + 1, dtype=torch.float64)
-    stamps = low + (steps * (NS / rate)).round().to(torch.int64)
+    if (high - low) / SECOND * rate > 1e9:
+        raise ValueError(f"rate: {rate:g} Hz over {(high - low) / SECOND:g} s makes more than 1e9 readings")
+    steps = torch.arange(int((high - low) / SECOND * rate) + 1, dtype=torch.float64)
+    stamps = low + (steps * (SECOND / rate)).round().to(torch.int64)
     with torch.no_grad():
         made = measure(fit.trajectory, stamps, gravity)
 
     rows = [
-        ("poses used", f"{len(record)} over {(last - first) / NS:.2f} s", ""),
+        ("poses used", f"{len(record)} over {(last - first) / SECOND:.2f} s", ""),
         *fit_rows(fit, dt),
         ("readings synthesised", f"{len(stamps)} at {rate:g} Hz", ""),
     ]
     report: dict = {"fit": fit_report(fit, dt), "window_ns": [first, last]}
     title = f"{poses.name}: {representation} spline of order {order}, knots {dt * 1e3:.4g} ms apart"
-    shown = stamps < low + 10 * NS
+    shown = stamps < low + 10 * SECOND
     lines, dots = excerpt(stamps, made, shown, first), None
     if recording is not None:
         within = recording.window(low, high)
@@ -124,13 +145,13 @@ def imu(
             ("gyroscope RMSE", f"{errors[0]:.4f}", "rad/s"),
             ("accelerometer RMSE", f"{errors[1]:.4f}", "m/s²"),
         ]
-        early = within.time_ns < low + 10 * NS
+        early = within.time_ns < low + 10 * SECOND
         lines = lines[0], ImuReading(lines[1].gyroscope + bias[0], lines[1].accelerometer + bias[1])
         dots = excerpt(within.time_ns, ImuReading(within.gyroscope, within.accelerometer), early, first)
         _write_comparison(out / "comparison.csv", within, biased)
     write_results(out, fit.trajectory, stamps, made)
-    imu_comparison(lines, dots, title).savefig(out / "imu.png", dpi=130)
-    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    save_figure(out / "imu.png", imu_comparison(lines, dots, title))
+    write_report(out / "report.json", report)
     names = ["trajectory.txt", "imu.csv", "imu.png", "report.json"]
     if recording is not None:
         names.append("comparison.csv")
@@ -151,7 +172,8 @@ def _write_comparison(path: Path, recorded: ImuRecord, made: ImuReading) -> None
     columns = torch.cat([recorded.gyroscope, recorded.accelerometer, made.gyroscope, made.accelerometer], -1)
     rows = np.column_stack([recorded.time_ns.numpy().astype(object), columns.numpy()])
     header = ",".join(["timestamp_ns", *names])
-    np.savetxt(path, rows, delimiter=",", fmt=["%d", *["%.9g"] * len(names)], header=header, comments="")
+    with replacing(path) as part:
+        np.savetxt(part, rows, delimiter=",", fmt=["%d", *["%.9g"] * len(names)], header=header, comments="")
 
 
 def _three(x: Tensor) -> str:

@@ -6,49 +6,45 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchspline.cli.common import NS
-from torchspline.cli.files import is_trajectory, open_poses
+from torchspline.cli.files import PoseFormat, is_trajectory, open_record
 from torchspline.cli.report import Report
-from torchspline.io import ImuRecord, PoseRecord, load_trajectory, read_imu
+from torchspline.io import ImuRecord, PoseRecord, load_trajectory
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
 EXAMPLES = """
 torchspline info poses.txt
 torchspline info V1_02_medium/imu0/data.csv --json
 torchspline info motion.npz
+gunzip -c poses.txt.gz | torchspline info -
+torchspline info drive.bag --topic /imu/data
 """
 
 
 def info(
-    file: Path, format: str | None = None, times: Path | None = None, topic: str | None = None
+    file: Path,
+    format: PoseFormat | None = None,
+    times: Path | None = None,
+    topic: str | None = None,
+    child: str | None = None,
 ) -> Report:
     """What is in a file: kind, rows, rate, gaps, duration, range of the numbers and their units.
 
     Args:
-        file: poses (TUM, EuRoC, KITTI, nerfstudio), IMU readings (EuRoC), a ROS bag, or a saved trajectory.
-        format: tum, euroc, kitti, ros or nerfstudio; by default recognised from the content.
+        file: poses (TUM, EuRoC, KITTI, nerfstudio, the root of BVH), IMU readings (EuRoC), a ROS bag, or a saved
+            trajectory; - is standard input.
+        format: by default recognised from the content.
         times: file of times that goes with KITTI poses.
-        topic: of a ROS bag.
+        topic: of a ROS bag; needed where it has several.
+        child: frame of the transforms in that topic; needed where it has several.
     """
     if is_trajectory(file):
         values, rows = _of_trajectory(load_trajectory(file))
         return Report(str(file), {"kind": "trajectory", **values}, [("kind", "trajectory", ""), *rows])
-    record = _open(file, format, times, topic)
+    record = open_record(file, format, times, topic, child)
     kind = "poses" if isinstance(record, PoseRecord) else "IMU readings"
     values, rows, notes = _of_record(record)
     return Report(str(file), {"kind": kind, **values}, [("kind", kind, ""), *rows], notes)
-
-
-def _open(file: Path, format: Any, times: Path | None, topic: str | None) -> PoseRecord | ImuRecord:
-    """As poses, and if it is none, as IMU readings."""
-    try:
-        return open_poses(file, format, times, topic)
-    except ValueError as first:
-        try:
-            return read_imu(file, format, topic)
-        except ValueError as second:
-            same = str(first) == str(second)
-            raise first if same else ValueError(f"not poses: {first}; not IMU readings: {second}") from None
 
 
 def _of_record(
@@ -67,10 +63,10 @@ def _of_record(
     for x, _ in columns.values():
         bad |= ~x.isfinite().all(-1)
     distinct = stamps.unique()
-    steps = distinct.diff().double() / NS
+    steps = distinct.diff().double() / SECOND
     interval = float(steps.median()) if len(steps) else float("nan")
     gaps = steps[steps > 3 * interval]
-    span = (int(distinct[-1]) - int(distinct[0])) / NS if len(distinct) else 0.0
+    span = (int(distinct[-1]) - int(distinct[0])) / SECOND if len(distinct) else 0.0
     values: dict[str, Any] = {
         "rows": len(stamps),
         "first_ns": int(distinct[0]) if len(distinct) else None,
@@ -116,7 +112,7 @@ def _of_trajectory(trajectory: Trajectory) -> tuple[dict[str, Any], list[tuple[s
     first, last = trajectory.domain
     nanoseconds = isinstance(first, int)
     unit = "ns" if nanoseconds else "s"
-    span = (last - first) / (NS if nanoseconds else 1)
+    span = (last - first) / (SECOND if nanoseconds else 1)
     tensors = [*trajectory.named_parameters(), *trajectory.named_buffers()]
     values: dict[str, Any] = {
         "family": type(trajectory).__name__,

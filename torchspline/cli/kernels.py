@@ -14,6 +14,8 @@ torchspline kernels show SE3 --order 6 --sweep reverse --precision float32
 torchspline kernels show SO3 --target triton
 """
 
+_HIGHEST = 20
+
 
 def show(
     group: str,
@@ -33,6 +35,8 @@ def show(
         precision: of the numbers.
         target: what compiles it: numba for the CPU, triton for a GPU.
     """
+    if not order <= _HIGHEST:
+        raise ValueError(f"order: expected at most {_HIGHEST}, got {order}; loops grow with its square")
     chosen = Group(group).name, order, derivatives, getattr(torch, precision)
     kernels = kernels_of(*chosen, nanoseconds=False) if target == "numba" else triton_kernels_of(*chosen)
     source = kernels.forward_source() if sweep == "forward" else kernels.reverse_source()

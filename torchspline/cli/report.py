@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,16 +27,18 @@ class Report:
     #: Printed as it is, before all else; scripts find it in the values.
     text: str = ""
     columns: tuple[str, ...] = ("", "value", "unit")
+    #: Whether standard output has the data, and this goes to standard error.
+    aside: bool = False
 
     def print(self) -> None:
-        """On standard output."""
+        """On standard output, or aside."""
         from rich.console import Console
         from rich.table import Table
         from rich.text import Text
 
         if self.text:
             print(self.text)
-        console = Console()
+        console = Console(stderr=self.aside)
         if self.rows:
             table = Table(*self.columns, title=self.title)
             for row in self.rows:
@@ -52,8 +55,9 @@ class Report:
                 console.print(f"written: {' '.join(map(str, self.files))}", markup=False, soft_wrap=True)
 
     def print_json(self, command: str) -> None:
-        """One line on standard output; numbers that are not finite are null."""
-        print(json.dumps(self.as_dict(command), allow_nan=False), flush=True)
+        """One line, there as well; numbers that are not finite are null."""
+        stream = sys.stderr if self.aside else sys.stdout
+        print(json.dumps(self.as_dict(command), allow_nan=False), file=stream, flush=True)
 
     def as_dict(self, command: str) -> dict[str, Any]:
         """Everything as plain values."""

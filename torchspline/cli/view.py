@@ -6,11 +6,11 @@ from typing import Literal
 
 import torch
 
-from torchspline.cli.common import NS
 from torchspline.cli.files import PoseFormat, fitted, is_trajectory, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import load_trajectory
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 from torchspline.view import write_page
 
 EXAMPLES = """
@@ -34,13 +34,14 @@ def view(
     format: PoseFormat | None = None,
     times: Path | None = None,
     topic: str | None = None,
+    child: str | None = None,
 ) -> Report:
     """A page with an interactive 3D view of a file, which any browser shows, also without a network.
 
     Poses are shown as dots, with a spline through them that tells frames and velocities.
 
     Args:
-        file: poses (TUM, EuRoC, KITTI, nerfstudio), a ROS bag, or a saved trajectory.
+        file: poses (TUM, EuRoC, KITTI, nerfstudio, the root of BVH), a ROS bag, or a saved trajectory.
         out: the page; by default named after the file, in this folder.
         open: show it in the browser.
         spacing: of the knots of the spline through poses, ms; auto finds one from the data.
@@ -52,7 +53,8 @@ def view(
         duration: how much of it to show, s.
         format: of the poses; by default recognised from their content.
         times: file of times that goes with KITTI poses.
-        topic: of a ROS bag.
+        topic: of a ROS bag; needed where it has several with poses.
+        child: frame of the transforms in that topic; needed where it has several.
     """
     measured, notes = None, []
     trajectory: Trajectory
@@ -60,7 +62,7 @@ def view(
         trajectory = load_trajectory(file)
     else:
         used, fit = fitted(
-            open_poses(file, format, times, topic), spacing, order, "split", gap, start, duration
+            open_poses(file, format, times, topic, child), spacing, order, "split", gap, start, duration
         )
         trajectory, measured, notes = fit.trajectory, used.position, fit.notes
     target = out or named_after(file, ".html")
@@ -70,7 +72,7 @@ def view(
 
         webbrowser.open(target.resolve().as_uri())
     first, last = trajectory.domain
-    span = (last - first) / (NS if isinstance(first, int) else 1)
+    span = (last - first) / (SECOND if isinstance(first, int) else 1)
     size = target.stat().st_size
     rows = [("duration", f"{span:.6g}", "s"), ("size of the page", f"{size / 1e6:.3g}", "MB")]
     values = {

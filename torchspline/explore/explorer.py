@@ -17,6 +17,7 @@ from torchspline.plot import basis_functions
 from torchspline.plot.figure import equal_axes, new_figure, numbers, times_of
 from torchspline.splines import KeyframeSpline
 from torchspline.splines.interpolation.registry import SCHEMES, SURVEY
+from torchspline.units import SECOND
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,7 +109,7 @@ class Explorer:
             if motion.position is None or motion.rotation is None or motion.position.ndim != 2:
                 raise ValueError(f"{path}: expected one trajectory of poses, got {trajectory.group}")
             poses = torch.cat([motion.position, motion.rotation], -1)
-            seconds = (t - t[0]).double() / (1e9 if t.dtype == torch.int64 else 1.0)
+            seconds = (t - t[0]).double() / (SECOND if t.dtype == torch.int64 else 1.0)
         else:
             seconds, poses = _some_of(read_poses(path, format, times), count)
         return cls(poses, seconds, methods)
@@ -265,4 +266,4 @@ def _some_of(record: PoseRecord, count: int) -> tuple[Tensor, Tensor]:
     at = at.unique()
     chosen = rows[at]
     poses = torch.cat([record.position[chosen], record.rotation[chosen]], -1)
-    return (stamps[at] - stamps[0]).double() / 1e9, poses
+    return (stamps[at] - stamps[0]).double() / SECOND, poses

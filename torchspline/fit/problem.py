@@ -10,23 +10,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.bends import Bends
-from torchspline.fit.implicit import differentiable as of_solution
-from torchspline.fit.model import Model, Spline, State, Unknown
-from torchspline.fit.priors import BoundPrior, Part, Prior
-from torchspline.fit.progress import progress_bar
 from torchspline.fit.residual import Residual, square_root_information, weighting_of
 from torchspline.fit.result import Result
-from torchspline.fit.solver import Options, minimise
-from torchspline.fit.system import BandSystem, SparseSystem, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.implicit import differentiable as of_solution
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import Model, Spline, Unknown
+from torchspline.fit.solving.priors import Part, Prior
+from torchspline.fit.solving.progress import progress_bar
+from torchspline.fit.solving.solver import Options, minimise
+from torchspline.fit.solving.terms import Term
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
 
 Array = NDArray[Any]
-#: Beyond these the equations are no band with a narrow border any more, and go to a sparse factorisation.
-_WIDEST_BORDER = 300
-_WIDEST_BAND = 6
 #: Names of splines in `Result.observability`.
 _RESERVED = re.compile(r"trajectory|spline \d+")
 
@@ -83,32 +79,22 @@ class Problem:
                     f"{slot}: {x.name} holds {len(x.value)}; expected {slot}=index, which of them each measurement "
                     "sees, got none"
                 )
+        for x in residual.clock.unknowns:
+            if x.value.ndim != 1:
+                raise ValueError(
+                    f"clock: expected a Variable of one number, shape (1,), got {x!r}; a row for each of several "
+                    "trajectories is for BatchProblem"
+                )
         self._check_times(residual)
         unknowns = [
             x
             for x in (*residual.arguments.values(), *residual.clock.unknowns)
             if isinstance(x, (Variable, BSpline))
         ]
-        self._know(unknowns)
+        include_unknowns(self, unknowns)
         self.residuals.append(residual)
         self._indices.append(indices)
         return residual
-
-    def _know(self, unknowns: Sequence[Unknown]) -> None:
-        """Count these among the unknowns, all or none of them; those of residuals are without being asked."""
-        new: list[Unknown] = []
-        for x in unknowns:
-            known = [*self._unknowns, *new]
-            if any(y is x for y in known):
-                continue
-            if isinstance(x, BSpline):
-                _check_spline("spline", x)
-            elif any(isinstance(y, Variable) and y.name == x.name for y in known):
-                raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
-            elif _RESERVED.fullmatch(x.name):
-                raise ValueError(f"variable: {x.name!r} is what reports call a spline; expected another name")
-            new.append(x)
-        self._unknowns += new
 
     def _check_times(self, residual: Residual) -> None:
         t, domain = residual.t.detach(), self.trajectory.domain
@@ -157,7 +143,7 @@ class Problem:
         assert root is not None
         root = root.detach().cpu()
         matrix = torch.diag(root.expand(size)) if root.ndim < 2 else root
-        self._know([variable])
+        include_unknowns(self, [variable])
         reference = variable.points(variable.value).reshape(count, -1)
         H = np.kron(np.eye(count), (matrix.mT @ matrix).numpy())
         self.priors.append(Prior([Part(variable, np.arange(count), reference)], H, np.zeros(len(H))))
@@ -245,7 +231,7 @@ class Problem:
         numbers = of_solution(linearizer, state, system) if differentiable else None
         return Result(linearizer, state, system, trace, numbers)
 
-    def prepare(self) -> "Linearizer":
+    def prepare(self) -> Linearizer:
         """The problem in arrays."""
         origin = self.trajectory.domain[0]
         for x in self._unknowns:
@@ -259,50 +245,21 @@ class Problem:
         return Linearizer(model, [*terms, *(prior.bind(model) for prior in self.priors)])
 
 
-class Linearizer:
-    """From numbers of the unknowns to normal equations."""
-
-    def __init__(self, model: Model, terms: Sequence[Term | Bends | BoundPrior]):
-        self.model, self.terms = model, list(terms)
-        self.fused = model.trajectory.local.fused
-        #: Of each term that touches the same unknowns wherever these stand: how far apart, and how many at a time.
-        self._reaches: dict[int, tuple[int, int]] = {}
-
-    def __call__(self, state: State) -> System:
-        system = self._empty(state)
-        for term in self.terms:
-            term.add_to(system, state)
-        return system
-
-    def system_of(self, term: Term | Bends | BoundPrior, state: State) -> System:
-        """What one of the terms has in the normal equations."""
-        system = self._empty(state)
-        term.add_to(system, state)
-        return system
-
-    def _empty(self, state: State) -> System:
-        """A band as wide as the measurements want it now, or a sparse matrix if that is much wider than one needs."""
-        model = self.model
-        width = narrow = 1
-        for term in self.terms:
-            reach = self._reaches.get(id(term))
-            if reach is None:
-                reach = self._reach(term.touched(state))
-                if not (isinstance(term, Term) and term.clock):
-                    self._reaches[id(term)] = reach
-            width, narrow = max(width, reach[0]), max(narrow, reach[1])
-        if width > _WIDEST_BAND * narrow or model.total - model.band > _WIDEST_BORDER:
-            return SparseSystem(model, self.fused)
-        return BandSystem(model, self.fused, width)
-
-    def _reach(self, columns: Array) -> tuple[int, int]:
-        """How wide a band these columns (runs, C) of unknowns need, and C."""
-        if columns.size == 0:
-            return 1, 1
-        model = self.model
-        spline = np.where(columns < model.band, columns, -1)
-        low = np.where(spline < 0, model.total, spline).min(axis=1)
-        return int((spline.max(axis=1) - low).max()) + 1, columns.shape[1]
+def include_unknowns(problem: Problem, unknowns: Sequence[Unknown]) -> None:
+    """Count these among the unknowns of a problem, all or none of them; those of residuals are without being asked."""
+    new: list[Unknown] = []
+    for x in unknowns:
+        known = [*problem._unknowns, *new]
+        if any(y is x for y in known):
+            continue
+        if isinstance(x, BSpline):
+            _check_spline("spline", x)
+        elif any(isinstance(y, Variable) and y.name == x.name for y in known):
+            raise ValueError(f"variable: expected one unknown of each name, got two called {x.name!r}")
+        elif _RESERVED.fullmatch(x.name):
+            raise ValueError(f"variable: {x.name!r} is what reports call a spline; expected another name")
+        new.append(x)
+    problem._unknowns += new
 
 
 def _check_spline(name: str, spline: BSpline) -> None:

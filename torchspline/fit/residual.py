@@ -2,7 +2,7 @@
 
 A residual is written once, on tuples of components (`arithmetic/`), as a function and its hand-derived reverse; from
 those two come the compiled loop, the reference on tensors, the rows of the Jacobian (the reverse of each unit vector)
-and the graph that a differentiable optimum needs. A new residual is one file in `residuals/` and one line in its
+and the graph that a differentiable optimum needs. A new residual is one file in `residuals/` and its name in their
 `__init__`; the tests then compare its reverse with automatic differentiation unasked.
 """
 
@@ -25,6 +25,7 @@ from torchspline.fit.variables import Variable
 from torchspline.groups.group import Group
 from torchspline.splines.bspline import BSpline
 
+_WEIGHTS = ("sigma", "covariance", "information")
 #: What may stand for an unknown: the unknown itself, a spline of it over time, or its known value.
 Argument = Variable | BSpline | Tensor
 
@@ -54,6 +55,11 @@ class Moment(NamedTuple):
     rates: tuple[Vector, ...]
 
 
+#: The arguments of a residual by slot, points of groups unit; and their cotangents, those of points body tangents.
+Given = Mapping[str, Vector]
+Cotangents = dict[str, Vector]
+
+
 @dataclass(frozen=True, eq=False)
 class Clock:
     """How the stamps of a sensor relate to the time of the trajectory.
@@ -62,7 +68,7 @@ class Clock:
     domain take no part while they are there.
 
     Args:
-        offset, skew: unknowns of one number each, s and s/s.
+        offset, skew: unknowns of one number each, s and s/s; in a `BatchProblem` one for each trajectory, (B, 1).
         mid: time of the trajectory at which the skew turns, in the unit of its times; by default the middle of its
             domain.
         delay: an unknown of one number, s, such as the line delay of a rolling shutter. late: by how many delays the
@@ -84,7 +90,7 @@ class Clock:
             if x is None:
                 continue
             checks.instance(name, x, Variable, "a torchspline.fit.Variable")
-            if x.group is not None or x.value.shape != (1,):
+            if x.group is not None or x.size != 1:
                 raise ValueError(f"{name}: expected a Variable of one number, shape (1,), got {x!r}")
         if self.mid is not None:
             checks.finite_number("mid", self.mid)
@@ -211,19 +217,14 @@ class Residual(ABC):
 
     @abstractmethod
     def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
     ) -> Vector:
         """The residual, R components, not weighted. `given` holds points of groups as unit ones."""
 
     @abstractmethod
     def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+    ) -> tuple[list[Moment], Cotangents]:
         """Cotangents of what the residual depends on, from its own: a moment for each of `at`, and those of `given`."""
 
     def __len__(self) -> int:
@@ -303,6 +304,13 @@ def weighting_of(
     return name, x
 
 
+def set_weighting(residual: Residual, kind: str, x: Tensor | None) -> None:
+    """Give a residual another weight, one that `weighting_of` would find good."""
+    residual.weighting = kind, x
+    sigma, covariance, information = (x if kind == name else None for name in _WEIGHTS)
+    residual._weights = sigma, covariance, information
+
+
 def square_root_information(weighting: tuple[str, Tensor | None]) -> Tensor | None:
     """W with W^T W the information: None for one, factors (...,) or (..., R), or matrices (..., R, R)."""
     kind, x = weighting
@@ -339,9 +347,9 @@ def _argument(name: str, x: Any, slot: Slot, count: int) -> Argument:
                 f"{name}: expected a Variable of {slot.group or f'{slot.size} numbers'}, got {x!r}"
             )
     elif isinstance(x, BSpline):
-        if slot.group is not None or x.group.name != f"R{slot.size}" or x.control_points.ndim != 2:
+        if slot.group is not None or x.group.name != f"R{slot.size}":
             raise ValueError(
-                f"{name}: expected a spline in R{slot.size} without a batch, got one in {x.group} of shape "
+                f"{name}: expected a spline in R{slot.size}, got one in {x.group} of shape "
                 f"{tuple(x.control_points.shape)}"
             )
     elif isinstance(x, Tensor):

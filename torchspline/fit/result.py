@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,16 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.model import State, Unknown
-from torchspline.fit.scatter import scatter
-from torchspline.fit.solver import Trace
-from torchspline.fit.system import BandSystem, Factor, SingularError, System
-from torchspline.fit.terms import Term
+from torchspline.fit.solving.linearizer import Linearizer
+from torchspline.fit.solving.model import State, Unknown, spacing_of
+from torchspline.fit.solving.scatter import Scatter
+from torchspline.fit.solving.solver import Trace
+from torchspline.fit.solving.system import BandSystem, Factor, SingularError, System
 from torchspline.fit.variables import Variable
 from torchspline.splines.bspline import BSpline
-
-if TYPE_CHECKING:
-    from torchspline.fit.problem import Linearizer
 
 Array = NDArray[Any]
 #: Eigenvalues of the normal equations, scaled to a diagonal of ones, below which a direction counts as left open: its
@@ -50,7 +47,7 @@ class Result:
 
     def __init__(
         self,
-        linearizer: "Linearizer",
+        linearizer: Linearizer,
         state: State,
         system: System,
         trace: Trace,
@@ -61,7 +58,7 @@ class Result:
         if numbers is None:
             points = {key: torch.from_numpy(x).clone() for key, x in state.points.items()}
             numbers = points | {key: x.clone() for key, x in state.values.items()}
-        self._scatter: dict[float, Array] = {}
+        self._scatter: dict[float, Scatter] = {}
         #: The trajectory's control points, unit, and the variables' values by name; with a graph if so asked.
         self.control_points = numbers[id(model.trajectory.module)]
         self.values = {v.name: numbers[id(v)] for v in model.variables}
@@ -91,7 +88,7 @@ class Result:
         A second residual of one name gets " 2" after it, and so on.
         """
         found: dict[str, Tensor] = {}
-        for term in self._terms():
+        for term in self._linearizer.measured:
             name, count = term.residual.name, 2
             while name in found:
                 name, count = f"{term.residual.name} {count}", count + 1
@@ -101,15 +98,12 @@ class Result:
     @cached_property
     def outside(self) -> int:
         """Measurements that an estimated clock moved out of the trajectory's domain; they had no weight."""
-        return sum(int(term.places(self._state).outside.sum()) for term in self._terms())
-
-    def _terms(self) -> list[Term]:
-        return [term for term in self._linearizer.terms if isinstance(term, Term)]
+        return sum(int(term.places(self._state).outside.sum()) for term in self._linearizer.measured)
 
     @property
     def variance_factor(self) -> float:
         """Weighted sum of squares over degrees of freedom: 1 if the standard deviations were right."""
-        rows = sum(term.numbers for term in self._terms())
+        rows = sum(term.numbers for term in self._linearizer.measured)
         return 2.0 * self.cost[-1] / max(rows - self._linearizer.model.total, 1)
 
     @cached_property
@@ -124,7 +118,7 @@ class Result:
             ValueError: the measurements do not determine all unknowns.
         """
         factor, found = self._determined(), {}
-        for name, term in zip(self.residuals, self._terms(), strict=True):
+        for name, term in zip(self.residuals, self._linearizer.measured, strict=True):
             own = self._linearizer.system_of(term, self._state)
             found[name] = term.numbers - factor.trace(own)
         return found
@@ -181,33 +175,68 @@ class Result:
         blocks = torch.from_numpy(self._determined().inverse(i, j))
         return blocks[0] if variable.value.ndim == 1 else blocks
 
-    def standard_deviation(self, variable: Variable, stretch: float | None = None) -> Tensor:
-        """Square roots of the diagonal of `covariance`; with `stretch` also where errors are alike for a while.
+    def standard_deviation(self, variable: Variable | BSpline, stretch: float | None = None) -> Tensor:
+        """Of a variable, square roots of the diagonal of `covariance`; of a spline, of its control points, `(M, D)`.
+
+        0 of control points that were frozen.
 
         Args:
+            variable: or the trajectory, or a spline that a residual depends on.
             stretch: s. Residuals may be correlated within stretches of the trajectory of this length, as they are where
                 a model is not exact or a bias wanders: the scatter of what stretches pull at counts then
                 (the cluster-robust covariance [Liang and Zeger 1986]), where it is larger. There are six
-                at least, and no more than the trajectory has stretches between knots.
+                at least, and no more than the trajectory has stretches between knots. For a spline at most its knot
+                spacing: errors alike for longer look like the spline. All its control points together tell one factor
+                for each component; it comes out a few percent too small where errors are alike for a tenth of a
+                stretch.
         Raises:
-            ValueError: as `covariance`; a stretch that is not above zero; too many variables for a band with a border.
+            ValueError: as `covariance`; a stretch that is not above zero, or too long for a spline.
         """
-        own = self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
-        if stretch is None:
-            return own
+        if not isinstance(variable, BSpline):
+            own = self.covariance(variable).diagonal(dim1=-2, dim2=-1).sqrt()
+            if stretch is None:
+                return own
+            variances = self._scattered(stretch).variances(self._linearizer.model.columns[id(variable)])
+            return torch.maximum(own, torch.from_numpy(np.sqrt(variances)).reshape(own.shape))
+        own = torch.from_numpy(np.sqrt(self._variances(variable)))
+        return own if stretch is None else own * torch.from_numpy(self._inflation(variable, stretch))
+
+    def _variances(self, spline: BSpline) -> Array:
+        """Of control points (M, D), 0 of those that stay."""
+        columns = self._linearizer.model.columns.get(id(spline))
+        if columns is None:
+            raise ValueError(
+                f"variable: {spline!r} is not among the splines that were solved for; expected the trajectory or a "
+                "spline that a residual depends on"
+            )
+        there, variances = columns >= 0, np.zeros(columns.shape)
+        variances[there] = self._determined().inverse(columns[there], columns[there])
+        return variances
+
+    def _inflation(self, spline: BSpline, stretch: float) -> Array:
+        """By what factors (D,) the errors of a spline are larger where they are alike for a while."""
+        spacing = spacing_of(spline)
+        if checks.positive("stretch", stretch) > spacing * (1 + 1e-9):
+            raise ValueError(
+                f"stretch: expected at most the knot spacing of the spline, {spacing:g} s, got {stretch:g}; errors "
+                "alike for longer cannot be told from it: choose knots farther apart, a shorter stretch, or None"
+            )
+        columns = self._linearizer.model.columns[id(spline)]
+        return self._scattered(stretch).inflation(columns, self._variances(spline))
+
+    def _scattered(self, stretch: float) -> Scatter:
         checks.positive("stretch", stretch)
         if stretch not in self._scatter:
-            self._scatter[stretch] = scatter(self._linearizer, self._state, self._factor, stretch)
-        model = self._linearizer.model
-        columns = model.columns[id(variable)] - model.band
-        found = torch.from_numpy(np.sqrt(np.square(self._scatter[stretch][:, columns]).sum(axis=0)))
-        return torch.maximum(own, found.reshape(own.shape))
+            self._scatter[stretch] = Scatter(self._linearizer, self._state, self._factor, stretch)
+        return self._scatter[stretch]
 
-    def trajectory_covariance(self, t: Tensor, derivatives: int = 0) -> Tensor:
+    def trajectory_covariance(self, t: Tensor, derivatives: int = 0, stretch: float | None = None) -> Tensor:
         """Covariance of the trajectory's state at times `t`, `(N, (1 + derivatives) D, (1 + derivatives) D)`.
 
         Of the value's body tangent, then of the derivatives (body frame, per second).
 
+        Args:
+            stretch: s, as for `standard_deviation` of a spline.
         Raises:
             ValueError: a time outside the domain; the measurements do not determine all unknowns.
         """
@@ -226,6 +255,9 @@ class Result:
         columns = np.where(columns >= 0, columns, np.maximum(columns.max(axis=1, keepdims=True), 0))
         i, j = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
         covariance = torch.from_numpy(J @ self._determined().inverse(i, j) @ J.swapaxes(1, 2))
+        if stretch is not None:
+            factors = torch.from_numpy(np.tile(self._inflation(trajectory, stretch), 1 + derivatives))
+            covariance = factors[:, None] * covariance * factors
         return covariance[0] if t.ndim == 0 else covariance
 
     def _solved(self) -> BSpline:
@@ -242,7 +274,7 @@ class Result:
 
     @property
     def banded(self) -> bool:
-        """Whether the normal equations are a band with a narrow border, as `standard_deviation` wants for stretches."""
+        """Whether the normal equations are a band with a narrow border, else a sparse matrix."""
         return isinstance(self._system, BandSystem)
 
     @cached_property
@@ -307,18 +339,3 @@ class Result:
             for i, spline in enumerate(model.splines)
         ]
         return names + [(variable.name, variable) for variable in model.variables]
-
-
-def control_point_deviation(result: Result, spline: BSpline) -> Tensor:
-    """Standard deviations of the steps of the control points of one of the problem's splines, `(M, D)`.
-
-    Those that stayed have 0.
-
-    Raises:
-        ValueError: the measurements do not determine all unknowns.
-    """
-    columns = result._linearizer.model.columns[id(spline)]
-    there = columns >= 0
-    variances = np.zeros(columns.shape)
-    variances[there] = result._determined().inverse(columns[there], columns[there])
-    return torch.from_numpy(np.sqrt(variances))

@@ -8,6 +8,7 @@ from torchspline import checks
 from torchspline.fit.residual import Residual
 from torchspline.fit.residuals.state import StateAcceleration, StateJerk, StateVelocity
 from torchspline.splines.bspline import BSpline
+from torchspline.units import NANOSECOND
 
 _KINDS: tuple[type[Residual], ...] = (StateVelocity, StateAcceleration, StateJerk)
 
@@ -58,7 +59,7 @@ def smoothness(
     start, end = trajectory.domain
     if trajectory.dt_ns is not None:
         t = torch.from_numpy(np.rint(u * trajectory.dt_ns).astype(np.int64)) + int(start)
-        spacing = trajectory.dt_ns * 1e-9
+        spacing = trajectory.dt_ns * NANOSECOND
     else:
         spacing = (end - start) / segments
         t = torch.from_numpy(start + u * spacing)

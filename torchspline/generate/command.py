@@ -37,7 +37,15 @@ def generate(
         done = write(recipe, out, seed, items, items_per_shard, progress)
     seconds = time.perf_counter() - began
     if json:
-        report = {**done._asdict(), "rank": rank, "world_size": world, "seconds": seconds, "folder": str(out)}
+        report = {
+            "command": "generate",
+            "passed": True,
+            **done._asdict(),
+            "rank": rank,
+            "world_size": world,
+            "seconds": seconds,
+            "folder": str(out),
+        }
         print(text.dumps(report), flush=True)
     else:
         process = f"process {rank} of {world}: " if world > 1 else ""

@@ -4,17 +4,18 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchspline import checks
 from torchspline.groups.group import SO3
+from torchspline.imu.base import Sensor
 from torchspline.imu.earth import standard_pressure
 from torchspline.imu.filters import LowPass
 from torchspline.imu.noise import Generators, random_walk, white_noise
 from torchspline.imu.parts import (
+    Given,
     above_zero,
     along_time,
-    batch_of,
     drawing_device,
     keep,
     sample_rate,
@@ -24,8 +25,6 @@ from torchspline.imu.parts import (
 from torchspline.imu.quantise import quantise, saturate
 from torchspline.imu.sampling import Sampling, in_order
 from torchspline.splines.trajectory import Kinematics, Trajectory
-
-Given = Tensor | Sequence[float] | float | None
 
 
 class AmbientReadings(NamedTuple):
@@ -43,7 +42,7 @@ class AmbientReadings(NamedTuple):
     instants: Tensor
 
 
-class _Ambient(nn.Module):
+class _Ambient(Sensor):
     """Sampling, bandwidth, noise and converter, which these sensors share; values have `channels` components."""
 
     channels: int
@@ -62,17 +61,13 @@ class _Ambient(nn.Module):
         low_pass: LowPass | None,
         range: Given,
         resolution: Given,
-        sampling: dict[str, Any],
+        sampling: Sampling,
         dtype: torch.dtype | None,
     ):
-        super().__init__()
-        if rate is not None:
-            checks.positive("rate", rate)
+        super().__init__(rate, dtype)
         if low_pass is not None:
             checks.instance("low_pass", low_pass, LowPass, "a torchspline.imu.LowPass")
-        if dtype not in (None, torch.float32, torch.float64):
-            raise TypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
-        self.rate, self.low_pass, self.dtype = rate, low_pass, dtype
+        self.low_pass = low_pass
         self._take("bias", bias, self.channels)
         for name, x, zero_too in (
             ("noise_density", noise_density, True),
@@ -81,7 +76,7 @@ class _Ambient(nn.Module):
             ("resolution", resolution, False),
         ):
             above_zero(name, self._take(name, x, self.channels), zero_too)
-        self.sampling = Sampling(**sampling)
+        self.sampling = sampling
 
     def _take(self, name: str, x: Any, *shape: int) -> Tensor | None:
         one = shape == (1,) and isinstance(x, Tensor)  # of a single channel, a batch is (*batch,)
@@ -91,10 +86,6 @@ class _Ambient(nn.Module):
         keep(self, name, taken)
         return taken
 
-    def _batches(self) -> dict[str, torch.Size]:
-        own = {**self._parameters, **self._buffers}
-        return {n: x.shape[: -2 if n == "soft_iron" else -1] for n, x in own.items() if x is not None}
-
     def _signal(self, motion: Kinematics) -> Tensor:
         """The noiseless values (*batch, N, channels)."""
         raise NotImplementedError
@@ -102,10 +93,7 @@ class _Ambient(nn.Module):
     def _sensed(self, trajectory: Trajectory, t: Tensor, generator: Generators) -> AmbientReadings:
         times_of(t, trajectory)
         at = t.reshape(1) if t.ndim == 0 else t
-        own = self._batches()
-        if self.sampling.random:
-            own["trajectory"] = batch_of(trajectory, at)
-        instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
+        instants, valid = self._instants(trajectory, at, generator)
         motion = trajectory.kinematics(instants)
         moving = motion.rotation if motion.rotation is not None else motion.position
         assert moving is not None
@@ -178,6 +166,7 @@ class Magnetometer(_Ambient):
     field: Tensor
     rotation: Tensor | None
     soft_iron: Tensor | None
+    matrices = ("soft_iron",)
 
     def __init__(
         self,
@@ -198,13 +187,8 @@ class Magnetometer(_Ambient):
         drop_probability: Tensor | float = 0.0,
         dtype: torch.dtype | None = None,
     ):
-        clock = {
-            "time_offset": time_offset,
-            "time_skew": time_skew,
-            "jitter": jitter,
-            "drop_probability": drop_probability,
-        }
-        super().__init__(bias, noise_density, random_walk, rate, low_pass, range, resolution, clock, dtype)
+        sampling = Sampling(time_offset, time_skew, jitter, drop_probability)
+        super().__init__(bias, noise_density, random_walk, rate, low_pass, range, resolution, sampling, dtype)
         if field is None:
             raise TypeError("field: expected a tensor or three numbers, got None")
         self._take("field", field, 3)
@@ -278,13 +262,8 @@ class Barometer(_Ambient):
         drop_probability: Tensor | float = 0.0,
         dtype: torch.dtype | None = None,
     ):
-        clock = {
-            "time_offset": time_offset,
-            "time_skew": time_skew,
-            "jitter": jitter,
-            "drop_probability": drop_probability,
-        }
-        super().__init__(bias, noise_density, random_walk, rate, low_pass, range, resolution, clock, dtype)
+        sampling = Sampling(time_offset, time_skew, jitter, drop_probability)
+        super().__init__(bias, noise_density, random_walk, rate, low_pass, range, resolution, sampling, dtype)
         for name, x in (("ground_height", ground_height), ("up", up)):
             if x is None:
                 raise TypeError(f"{name}: expected a tensor or numbers, got None")

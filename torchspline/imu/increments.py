@@ -11,7 +11,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.groups.group import SO3
 from torchspline.imu import stamps
-from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading, _no_body, _vector
+from torchspline.imu.synthesis import STANDARD_GRAVITY, ImuReading, no_rigid_body, vector_argument
 from torchspline.splines.trajectory import MECHANICS, Kinematics, Mounted, Trajectory
 
 #: Points of Gauss-Legendre quadrature within an interval.
@@ -59,13 +59,13 @@ def increments(
     if not isinstance(compensated, bool):
         raise ValueError(f"compensated: expected True or False, got {compensated!r}")
     if trajectory.group.name not in MECHANICS:
-        raise _no_body(trajectory)
+        raise no_rigid_body(trajectory)
     if T_body_imu is not None:
         trajectory = Mounted(trajectory, T_body_imu, name="T_body_imu")
     motion = trajectory.kinematics(t)
     q, v = motion.rotation, motion.velocity
     if q is None or v is None:
-        raise _no_body(trajectory)
+        raise no_rigid_body(trajectory)
     if t.ndim == 0:
         raise ValueError("t: expected shape (N,) or (*batch, N), times in a row, got ()")
     h = stamps.intervals(t, v.shape[:-1], v.dtype, device=v.device)[..., None]
@@ -85,12 +85,12 @@ def increments(
     # E (a + 2 rate x v - g), and d(E v)/ds = E (a + rate x v).
     assert rate is not None
     assert inside.velocity is not None
-    turn = _exp(rate * h)
+    turn = rotation_by(rate * h)
     moving = inside.velocity.unflatten(-2, (-1, NODES))
     coriolis = torch.linalg.cross(rate[..., None, :].expand_as(moving), moving)
-    at_nodes = _exp(rate[..., None, :] * (h[..., None] * nodes[:, None]))
-    pulled = (weights[:, None] * _turn(at_nodes, coriolis)).sum(-2) * h
-    gained = _turn(turn, v[..., 1:, :]) - v[..., :-1, :] + pulled - mean_turn(rate * h, g * h)
+    at_nodes = rotation_by(rate[..., None, :] * (h[..., None] * nodes[:, None]))
+    pulled = (weights[:, None] * rotate(at_nodes, coriolis)).sum(-2) * h
+    gained = rotate(turn, v[..., 1:, :]) - v[..., :-1, :] + pulled - mean_turn(rate * h, g * h)
     return Increments(_log(_between(start, SO3.compose(turn, end, validate=False))), _unturn(start, gained))
 
 
@@ -112,7 +112,7 @@ def sampled_increments(reading: ImuReading, t: Tensor) -> Increments:
     """
     checks.instance("reading", reading, ImuReading, "an ImuReading")
     w, f = reading
-    _check_pair(reading, ("gyroscope", "accelerometer"), 1)
+    check_pair(reading, ("gyroscope", "accelerometer"), 1)
     h = stamps.intervals(t, w.shape[:-1], w.dtype, device=w.device)[..., None]
     angle = rotation_between_samples(w, h)
     cross, (w0, w1), (f0, f1) = torch.linalg.cross, _ends(w), _ends(f)
@@ -140,7 +140,7 @@ def compensate(integrals: Increments, t: Tensor) -> Increments:
     """
     checks.instance("integrals", integrals, Increments, "Increments")
     a, v = integrals
-    _check_pair(integrals, ("angle", "velocity"), 0)
+    check_pair(integrals, ("angle", "velocity"), 0)
     count = a.shape[-2]
     h = stamps.intervals(t, (*a.shape[:-2], count + 1), a.dtype, device=a.device)[..., None]
     if count < 2:
@@ -209,7 +209,7 @@ def world_vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor
 
     Numbers of samples and of intervals differ, so that (N, 3) would go with one of them and not with the other.
     """
-    x = _vector(name, x, like)
+    x = vector_argument(name, x, like)
     if x.ndim > 1 and x.shape[-2] != 1:
         raise ValueError(f"{name}: expected shape (3,), or (*batch, 1, 3), got {tuple(x.shape)}")
     return x
@@ -219,7 +219,8 @@ def _ends(x: Tensor) -> tuple[Tensor, Tensor]:
     return x[..., :-1, :], x[..., 1:, :]
 
 
-def _turn(q: Tensor, x: Tensor) -> Tensor:
+def rotate(q: Tensor, x: Tensor) -> Tensor:
+    """Vectors turned by rotations."""
     return SO3.act(q, x, validate=False)
 
 
@@ -235,11 +236,12 @@ def _log(q: Tensor) -> Tensor:
     return SO3.log(q, validate=False)
 
 
-def _exp(x: Tensor) -> Tensor:
+def rotation_by(x: Tensor) -> Tensor:
+    """Rotations, of rotation vectors."""
     return SO3.exp(x, validate=False)
 
 
-def _check_pair(pair: tuple[Tensor, Tensor], names: tuple[str, str], least: int) -> None:
+def check_pair(pair: tuple[Tensor, Tensor], names: tuple[str, str], least: int) -> None:
     """Two tensors (*batch, N, 3) of one shape and kind, with at least `least` rows."""
     for name, x in zip(names, pair, strict=True):
         checks.is_floating_tensor(name, x)

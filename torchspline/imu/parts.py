@@ -6,8 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchspline import checks
+from torchspline import checks, units
 from torchspline.splines.trajectory import Trajectory
+
+#: A parameter of a sensor: a tensor, numbers, or one number for all its entries; None where there is none.
+Given = Tensor | Sequence[float] | float | None
 
 
 def keep(module: nn.Module, name: str, x: Tensor | None) -> None:
@@ -104,8 +107,7 @@ def sample_rate(t: Tensor, rate: float | None) -> Tensor:
         raise ValueError(
             f"rate: expected samples per second where stamps have no interval ({t.shape[-1]} of them), got None"
         )
-    span = (t[..., -1] - t[..., 0]).detach().to(torch.float64)
-    seconds = span * 1e-9 if t.dtype == torch.int64 else span
+    seconds = units.seconds((t[..., -1] - t[..., 0]).detach())
     if checks.values_visible(seconds) and checks.seen_true((seconds > 0).all()) is False:
         raise ValueError(f"t: expected increasing times, got a duration of {seconds.min().item():g} s")
     return (t.shape[-1] - 1) / seconds

@@ -6,12 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchspline import checks
+from torchspline import checks, units
 from torchspline.imu.noise import Generators, white_noise
 from torchspline.imu.parts import above_zero, drawing_device, keep, tensor_of
 from torchspline.splines.trajectory import Trajectory
-
-_NANOSECOND = 1e-9
 
 
 class Instants(NamedTuple):
@@ -88,14 +86,9 @@ class Sampling(nn.Module):
         own = {n: x.shape for n, x in (*self._parameters.items(), *self._buffers.items()) if x is not None}
         checks.broadcast(t=t.shape[:-1], **own)
         late: Tensor | None = None
-        seconds = t.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else t.to(torch.float64)
         if self.time_skew is not None:
             start, stop = trajectory.domain
-            mid = 0.5 * (start + stop)
-            if t.dtype == torch.int64:  # differences of epochs in whole nanoseconds first
-                since = (t - int(mid)).to(torch.float64) * _NANOSECOND
-            else:
-                since = seconds - mid
+            since = units.seconds_since(t, 0.5 * (start + stop))
             skew = _column(self.time_skew)
             offset = 0.0 if self.time_offset is None else _column(self.time_offset)
             late = since - (since - offset) / (1.0 + skew)
@@ -134,17 +127,17 @@ def shifted(t: Tensor, by: Tensor) -> Tensor:
             "t: expected torch.float64 seconds where time_offset, time_skew or jitter requires grad, got "
             "torch.int64; whole nanoseconds have no gradient"
         )
-    return t + (by / _NANOSECOND).round().to(torch.int64)
+    return t + units.nanoseconds(by)
 
 
 def in_order(instants: Tensor) -> Tensor:
     """The instants themselves, which a filter needs to increase, as jitter may not let them."""
     steps = instants.detach().diff(dim=-1)
     if checks.values_visible(steps) and steps.numel() and checks.seen_true((steps > 0).all()) is False:
-        unit = _NANOSECOND if instants.dtype == torch.int64 else 1.0
+        least = steps.min().item() * units.unit_of(steps)
         raise ValueError(
             "jitter: expected instants that increase, as stamps do, where a filter follows, got two "
-            f"{steps.min().item() * unit:g} s apart; choose one well below the interval of stamps, and these increasing"
+            f"{least:g} s apart; choose one well below the interval of stamps, and these increasing"
         )
     return instants
 

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchspline import checks
 from torchspline.groups.group import SE3, SO3
 from torchspline.imu import stamps
+from torchspline.imu.base import Sensor
 from torchspline.imu.calibration import lower_triangular, sensor_matrix
 from torchspline.imu.filters import LowPass
 from torchspline.imu.ideal import Scene, exposure
@@ -24,9 +25,9 @@ from torchspline.imu.noise import (
 )
 from torchspline.imu.parameters import ImuNoise
 from torchspline.imu.parts import (
+    Given,
     above_zero,
     along_time,
-    batch_of,
     bias_of,
     drawing_device,
     keep,
@@ -41,7 +42,6 @@ from torchspline.kernels.mode import plain
 from torchspline.splines.trajectory import MECHANICS, Trajectory
 
 BIASES = ("gyroscope_bias", "accelerometer_bias")
-Given = Tensor | Sequence[float] | float | None
 
 
 class Readings(NamedTuple):
@@ -61,7 +61,7 @@ class Readings(NamedTuple):
     instants: Tensor
 
 
-class Imu(nn.Module):
+class Imu(Sensor):
     """An IMU: trajectory and stamps in, readings out. Every part is optional; without any it is `measure`.
 
     Effects in their order, each differentiable in its parameters unless it says otherwise:
@@ -114,6 +114,7 @@ class Imu(nn.Module):
     accelerometer_arms: Tensor | None
     gravity: Tensor
     earth_rate: Tensor | None
+    matrices = ("g_sensitivity", "accelerometer_arms")
 
     def __init__(
         self,
@@ -145,15 +146,11 @@ class Imu(nn.Module):
         accelerometer_resolution: Given = None,
         dtype: torch.dtype | None = None,
     ):
-        super().__init__()
+        super().__init__(rate, dtype)
         if noise is not None:
             checks.instance("noise", noise, ImuNoise, "a torchspline.imu.ImuNoise")
-        if rate is not None:
-            checks.positive("rate", rate)
-        if dtype not in (None, torch.float32, torch.float64):
-            raise TypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         checks.whole("averaging", averaging, 0)
-        self.rate, self.averaging, self.dtype = rate, averaging, dtype
+        self.averaging = averaging
         self.noisy = noise is not None
         for field in fields(ImuNoise):  # tensors move, and are learnt, with the module
             x = 0.0 if noise is None else getattr(noise, field.name)
@@ -239,11 +236,8 @@ class Imu(nn.Module):
                 f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
             )
         at = t.reshape(1) if t.ndim == 0 else t
-        own = self._batches()
-        if self.sampling.random:
-            biases = {n: x for n in BIASES if isinstance(x := getattr(self, n), Trajectory)}
-            own |= {name: batch_of(x, at) for name, x in {"trajectory": trajectory, **biases}.items()}
-        instants, valid = self.sampling(trajectory, at, generator, checks.broadcast(**own))
+        biases = {n: x for n in BIASES if isinstance(x := getattr(self, n), Trajectory)}
+        instants, valid = self._instants(trajectory, at, generator, biases)
         signal = self._filtered(self._exposure(trajectory, at, instants), instants)
         checks.broadcast(trajectory=signal.shape[:-2], **self._batches())
         if self.dtype is not None:
@@ -343,12 +337,6 @@ class Imu(nn.Module):
         return compensate(Increments(w[..., 1:, :] * h, f[..., 1:, :] * h), t)
 
     # ------------------------------------------------------------------ parts of the chain
-
-    def _batches(self) -> dict[str, torch.Size]:
-        """Batch shapes of the parameters that may have one."""
-        own = {**self._parameters, **self._buffers}
-        square = ("g_sensitivity", "accelerometer_arms")
-        return {n: x.shape[: -2 if n in square else -1] for n, x in own.items() if x is not None}
 
     def _exposure(self, trajectory: Trajectory, at: Tensor, instants: Tensor) -> Tensor:
         mount = self.T_body_imu

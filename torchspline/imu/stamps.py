@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchspline import checks
+from torchspline import checks, units
 
-_NANOSECOND = 1e-9
 #: What float32 may round off times, as a share of the mean interval. That errors of intervals sum to nothing is why it
 #: may be more than the thousandth of a spline's spacing.
 _ROUNDED = 0.05
@@ -63,8 +62,7 @@ def intervals(
         raise ValueError(f"t: expected {expected}, got {a} and then {b}")
     if t.dtype == torch.float32:
         _check_rounding(t.detach(), steps.detach())
-    seconds = steps.to(torch.float64) * _NANOSECOND if t.dtype == torch.int64 else steps
-    return seconds.to(dtype)
+    return (units.seconds(steps) if t.dtype == torch.int64 else steps).to(dtype)
 
 
 def _check_rounding(t: Tensor, steps: Tensor) -> None:

@@ -11,11 +11,11 @@ from torchspline.groups.group import SO3
 from torchspline.imu import stamps
 from torchspline.imu.increments import (
     Increments,
-    _check_pair,
-    _exp,
-    _turn,
+    check_pair,
     mean_turn,
+    rotate,
     rotation_between_samples,
+    rotation_by,
     world_vector,
 )
 from torchspline.imu.scan import rotation_products
@@ -87,7 +87,7 @@ def strapdown(
     """
     checks.instance("increments", increments, Increments, "Increments")
     checks.instance("start", start, Navigation, "a Navigation")
-    _check_pair(increments, ("angle", "velocity"), 0)
+    check_pair(increments, ("angle", "velocity"), 0)
     angle, gained = increments
     samples = (*angle.shape[:-2], angle.shape[-2] + 1)
     h = stamps.intervals(t, samples, angle.dtype, device=angle.device)[..., None]
@@ -98,20 +98,20 @@ def strapdown(
     g = world_vector("gravity", gravity, angle)
     rotation = _rotations(angle, q0)
     if earth_rate is None:
-        velocity = _running(v0, _turn(rotation[..., :-1, :], gained) + g * h)
+        velocity = _running(v0, rotate(rotation[..., :-1, :], gained) + g * h)
     else:
         rate = world_vector("earth_rate", earth_rate, angle)
         elapsed = _running(torch.zeros_like(v0[..., :1]), h.expand(*angle.shape[:-1], 1))
         # The products so far are in axes that do not turn. Velocity obeys v' + 2 rate x v = force + gravity, of which
         # Exp(2 rate t) v is an integral of the right side alone.
-        turned = SO3.inverse(_exp(rate * elapsed), validate=False)
+        turned = SO3.inverse(rotation_by(rate * elapsed), validate=False)
         rotation = SO3.compose(turned, rotation, validate=False)
-        felt = _turn(_exp(0.5 * rate * h), _turn(rotation[..., :-1, :], gained)) + mean_turn(
+        felt = rotate(rotation_by(0.5 * rate * h), rotate(rotation[..., :-1, :], gained)) + mean_turn(
             2.0 * rate * h, g * h
         )
-        twice = _exp(2.0 * rate * elapsed)
-        velocity = _running(v0, _turn(twice[..., :-1, :], felt))
-        velocity = _turn(SO3.inverse(twice, validate=False), velocity)
+        twice = rotation_by(2.0 * rate * elapsed)
+        velocity = _running(v0, rotate(twice[..., :-1, :], felt))
+        velocity = rotate(SO3.inverse(twice, validate=False), velocity)
     return Navigation(rotation, velocity, _running(p0, _travelled(velocity, h)))
 
 
@@ -124,7 +124,7 @@ def _rotations(angle: Tensor, start: Tensor | None) -> Tensor:
         start = SO3.identity(*batch, dtype=angle.dtype, device=angle.device)
     else:
         start = SO3.normalize(start, validate=False).expand(*batch, 4)
-    return rotation_products(start, _exp(angle))
+    return rotation_products(start, rotation_by(angle))
 
 
 def _running(start: Tensor, steps: Tensor) -> Tensor:

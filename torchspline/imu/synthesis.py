@@ -52,29 +52,33 @@ def measure(
     """
     checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
     if trajectory.group.name not in MECHANICS:
-        raise _no_body(trajectory)
+        raise no_rigid_body(trajectory)
     if T_body_imu is not None:
         trajectory = Mounted(trajectory, T_body_imu, name="T_body_imu")
     motion = trajectory.kinematics(t)
     if motion.rotation is None or motion.acceleration is None or motion.angular_velocity is None:
-        raise _no_body(trajectory)
-    world = motion.acceleration - _vector("gravity", gravity, motion.acceleration)
+        raise no_rigid_body(trajectory)
+    world = motion.acceleration - vector_argument("gravity", gravity, motion.acceleration)
     accelerometer = SO3.act(SO3.inverse(motion.rotation, validate=False), world, validate=False)
     gyroscope = motion.angular_velocity
     if gyroscope_bias is not None:
-        gyroscope = gyroscope + _vector("gyroscope_bias", gyroscope_bias, gyroscope)
+        gyroscope = gyroscope + vector_argument("gyroscope_bias", gyroscope_bias, gyroscope)
     if accelerometer_bias is not None:
-        accelerometer = accelerometer + _vector("accelerometer_bias", accelerometer_bias, accelerometer)
+        accelerometer = accelerometer + vector_argument(
+            "accelerometer_bias", accelerometer_bias, accelerometer
+        )
     return ImuReading(gyroscope, accelerometer)
 
 
-def _no_body(trajectory: Trajectory) -> ValueError:
+def no_rigid_body(trajectory: Trajectory) -> ValueError:
+    """What to raise for a trajectory without rotation or position."""
     return ValueError(
         f"trajectory: expected one with rotation and position, such as SE3 or R3xSO3, got {trajectory.group}"
     )
 
 
-def _vector(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
+def vector_argument(name: str, x: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    """A vector (3,), or what broadcasts with the readings `like` (*batch, N, 3), in their dtype."""
     if isinstance(x, Tensor):
         checks.is_floating_tensor(name, x)
         checks.same_kind(trajectory=like, **{name: x})

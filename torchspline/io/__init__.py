@@ -2,8 +2,8 @@
 calibration finds: `read_imu_parameters`, `read_camchain` and their writers.
 
 Trajectories: `save_trajectory`, `load_trajectory`. Cameras of nerfstudio: `read_nerfstudio`, `write_nerfstudio`.
-Bags of ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. To add a format, write one module that ends
-with its `FORMAT` and name the module in `_FORMATS` below.
+Bags of ROS: `read_poses` and `read_imu` with `topic`, `write_rosbag`. The viewer of rerun: `write_rerun`. To add a
+format, write one module that ends with its `FORMAT` and name the module in `_FORMATS` below.
 """
 
 from os import PathLike
@@ -19,6 +19,7 @@ from torchspline.io.imu_parameters import ImuParameters, read_imu_parameters, wr
 from torchspline.io.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchspline.io.records import ImuRecord, PoseRecord
 from torchspline.io.registry import Format
+from torchspline.io.rerun import write_rerun
 from torchspline.io.ros import write_rosbag
 from torchspline.io.text import Table, read_table
 from torchspline.io.trajectory import load_trajectory, save_trajectory
@@ -43,6 +44,7 @@ __all__ = [
     "write_imu_parameters",
     "write_nerfstudio",
     "write_poses",
+    "write_rerun",
     "write_rosbag",
 ]
 
@@ -54,6 +56,7 @@ def read_poses(
     format: str | None = None,
     times: str | PathLike[str] | None = None,
     topic: str | None = None,
+    child: str | None = None,
 ) -> PoseRecord:
     """Read stamped poses, body to world: metres, quaternions [w, x, y, z], exact nanoseconds.
 
@@ -63,21 +66,23 @@ def read_poses(
             a bag).
         format: "euroc", "kitti", "ros" or "tum"; found from the content when not given.
         times: the file of stamps, for KITTI only; looked for beside the poses when not given.
-        topic: of a ROS bag, with PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry messages; the
-            only one there is when not given. Messages are stamped by their headers.
+        topic: of a ROS bag, with PoseStamped, PoseWithCovarianceStamped, TransformStamped, Odometry or TFMessage
+            messages; the only one there is when not given, where TFMessages count if there is nothing else. Messages
+            are stamped by their headers.
+        child: of a topic with transforms of several frames, the one whose poses are read.
     Returns:
         PoseRecord: the rows as they are in the file, also where they are unsorted, repeated or NaN.
     Raises:
         FileNotFoundError: no such file, or no file of stamps.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
-    if _is_bag(path, format, topic):
-        return ros.read_poses(_path(path), topic)
+    if _is_bag(path, format, topic=topic, child=child):
+        return ros.read_poses(_path(path), topic, child)
     table, chosen = _open(_path(path), format, "read_poses", "pose_files")
     assert chosen.read_poses
     if times is not None and not chosen.separate_times:
         raise ValueError(f"{path}: {chosen.name} files hold their own stamps; leave out times={str(times)!r}")
-    return chosen.read_poses(table, None if times is None else Path(times))
+    return chosen.read_poses(table, None if times is None else _path(times, "times"))
 
 
 def read_imu(path: str | PathLike[str], format: str | None = None, topic: str | None = None) -> ImuRecord:
@@ -93,46 +98,67 @@ def read_imu(path: str | PathLike[str], format: str | None = None, topic: str | 
         FileNotFoundError: no such file.
         ValueError: content that cannot be read as this format; the message names the file and the line.
     """
-    if _is_bag(path, format, topic):
+    if _is_bag(path, format, topic=topic):
         return ros.read_imu(_path(path), topic)
     table, chosen = _open(_path(path), format, "read_imu", "imu_files")
     assert chosen.read_imu
     return chosen.read_imu(table)
 
 
-def write_poses(path: str | PathLike[str], record: PoseRecord, format: str = "tum") -> None:
-    """Write poses as "tum" or "euroc"; reading them back gives the same stamps and float64 numbers.
+def write_poses(
+    path: str | PathLike[str],
+    record: PoseRecord,
+    format: str = "tum",
+    times: str | PathLike[str] | None = None,
+) -> None:
+    """Write poses as "tum", "euroc" or "kitti"; reading them back gives the same stamps and float64 numbers.
 
-    Gzipped when the name ends with .gz. An existing file is replaced.
+    KITTI has matrices: rotations come back to rounding, as unit quaternions. Gzipped when the name ends with .gz. An
+    existing file is replaced, whole or not at all.
 
+    Args:
+        times: for KITTI only, the file that the stamps go into; when not given, one beside the poses that
+            `read_poses` finds: `times.txt` for `poses.txt`, `00_times.txt` for `00.txt` and `00_gt.txt`.
     Raises:
-        FileNotFoundError: the folder of `path` does not exist.
-        ValueError: a format that is unknown or cannot be written, a record without rows.
+        FileNotFoundError: the folder of `path` or `times` does not exist.
+        ValueError: a format that is unknown or cannot be written, a record without rows, `times` where the format
+            holds its own stamps.
     """
+    (form,) = _formats("write_poses", format)
+    if times is not None and not form.separate_times:
+        raise ValueError(
+            f"times: expected none, since {format} files hold their own stamps, got {str(times)!r}"
+        )
+    stamps = None if times is None else _path(times, "times")
     if isinstance(record, PoseRecord):
         zero = torch.nonzero((record.rotation == 0).all(-1)).flatten()
         if len(zero):
             raise ValueError(f"record: expected quaternions that are not zero, got one at row {int(zero[0])}")
-    _write(path, record, PoseRecord, format, "write_poses")
+    path = _checked(path, record, PoseRecord)
+    assert form.write_poses
+    form.write_poses(path, record, stamps)
 
 
 def write_imu(path: str | PathLike[str], record: ImuRecord, format: str = "euroc") -> None:
     """Write IMU samples as an EuRoC csv; reading them back gives the same stamps and float64 numbers.
 
-    Gzipped when the name ends with .gz. An existing file is replaced.
+    Gzipped when the name ends with .gz. An existing file is replaced, whole or not at all.
 
     Raises:
         FileNotFoundError: the folder of `path` does not exist.
         ValueError: a format that is unknown or cannot be written, a record without rows.
     """
-    _write(path, record, ImuRecord, format, "write_imu")
+    (form,) = _formats("write_imu", format)
+    assert form.write_imu
+    form.write_imu(_checked(path, record, ImuRecord), record)
 
 
-def _is_bag(path: str | PathLike[str], format: str | None, topic: str | None) -> bool:
-    """Whether a ROS bag is meant; topics are for those alone."""
+def _is_bag(path: str | PathLike[str], format: str | None, **choices: str | None) -> bool:
+    """Whether a ROS bag is meant; topics and frames are for those alone."""
     bag = format == ros.NAME or (format is None and ros.is_bag(_path(path)))
-    if topic is not None and not bag:
-        raise ValueError(f"topic: expected none, since {path} is no ROS bag, got {topic!r}")
+    for name, choice in choices.items():
+        if choice is not None and not bag:
+            raise ValueError(f"{name}: expected none, since {path} is no ROS bag, got {choice!r}")
     return bag
 
 
@@ -173,19 +199,17 @@ def _inside(folder: Path, files: list[str]) -> Path:
     raise FileNotFoundError(f"{folder}: expected a folder that holds {' or '.join(files)}")
 
 
-def _path(path: str | PathLike[str]) -> Path:
+def _path(path: str | PathLike[str], name: str = "path") -> Path:
     if not isinstance(path, (str, PathLike)):
-        raise TypeError(f"path: expected a path, got {type(path).__name__}")
+        raise TypeError(f"{name}: expected a path, got {type(path).__name__}")
     return Path(path)
 
 
-def _write(
-    path: str | PathLike[str], record: PoseRecord | ImuRecord, kind: type, name: str, action: str
-) -> None:
+def _checked(path: str | PathLike[str], record: PoseRecord | ImuRecord, kind: type) -> Path:
+    """The path that a record of this kind goes to."""
     path = _path(path)
-    (form,) = _formats(action, name)
     if not isinstance(record, kind):
         raise TypeError(f"record: expected a {kind.__name__}, got {type(record).__name__}")
     if not len(record):
         raise ValueError(f"{path}: expected rows to write, got an empty record")
-    getattr(form, action)(path, record)
+    return path

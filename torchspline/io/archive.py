@@ -1,12 +1,19 @@
-"""Archives of arrays (npz) and bounded decompression: what a file promises is checked before memory is spent on it."""
+"""Archives of arrays (npz), bounded decompression: what a file promises is checked before memory is spent on it.
+
+And files that are written whole or not at all.
+"""
 
 import gzip
 import io
 import math
+import secrets
+import shutil
 import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +66,8 @@ def read_bytes(path: Path) -> bytes:
         content = path.read_bytes()
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
+    except OSError as reason:
+        raise OSError(reason.errno, reason.strerror, str(path)) from None  # which reading alone does not say
     if not content.startswith(b"\x1f\x8b"):
         return content
     most = allowed_size(len(content))
@@ -112,15 +121,49 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write an npz archive under exactly this name. Raises `FileNotFoundError` where the folder does not exist."""
-    check_folder(path)
-    with path.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    packed = io.BytesIO()  # archives go back to their beginning, which pipes cannot
+    np.savez(packed, allow_pickle=False, **arrays)
+    with replacing(path) as part:
+        part.write_bytes(packed.getbuffer())
 
 
 def check_folder(path: Path) -> None:
     """`FileNotFoundError` if the folder that `path` is to stand in does not exist."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name in the folder of `path` to write to; it becomes `path` when the block ends, and is gone if that fails.
+
+    Whoever is interrupted in between leaves the file that was there, and no half of another. What is no regular file
+    (a pipe, /dev/stdout) is written to directly. Raises `FileNotFoundError` where the folder does not exist.
+    """
+    check_folder(path)
+    if path.exists() and (not path.is_file() or path.is_relative_to("/dev")):
+        yield path
+        return
+    target = path.resolve()  # a link stays one
+    part = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
+    try:
+        yield part
+        with suppress(FileNotFoundError):
+            shutil.copymode(target, part)
+        part.replace(target)
+    except OSError as reason:
+        if reason.filename in (str(part), part):
+            raise type(reason)(reason.errno, reason.strerror, str(path)) from None
+        raise
+    finally:
+        with suppress(OSError):
+            part.unlink()
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, gzipped when its name ends with .gz. Raises as `replacing`."""
+    with replacing(path) as part:
+        part.write_bytes(gzip.compress(content, 6, mtime=0) if path.suffix == ".gz" else content)
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.groups.group import SE3
+from torchspline.io.archive import write_bytes
 from torchspline.io.camera import Camera, camera_from
 from torchspline.io.sections import number, numbered, read_sections, section_of
 from torchspline.io.yaml import short
@@ -119,7 +120,7 @@ def write_camchain(path: str | PathLike[str], chain: CamChain) -> None:
                 "timeshift_cam_imu": float(chain.time_offset[i]),
             }
             content[f"cam{i}"] = section
-    path.write_text(yaml.safe_dump(content, default_flow_style=None, sort_keys=False), encoding="utf-8")
+    write_bytes(path, yaml.safe_dump(content, default_flow_style=None, sort_keys=False).encode())
 
 
 def _matrix(name: str, rows: Any) -> Tensor:

@@ -58,7 +58,7 @@ def read_imu(table: Table) -> ImuRecord:
     )
 
 
-def write_poses(path: Path, record: PoseRecord) -> None:
+def write_poses(path: Path, record: PoseRecord, times: Path | None = None) -> None:
     """Write an EuRoC pose csv, gzipped when the name ends with .gz."""
     _write(path, _POSE_HEAD, record.time_ns, record.position, record.rotation)
 

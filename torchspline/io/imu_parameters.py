@@ -15,6 +15,7 @@ from torchspline import checks
 from torchspline.groups.convert import from_rotation_matrix, from_transform_matrix, to_transform_matrix
 from torchspline.groups.group import SE3, SO3
 from torchspline.imu.parameters import ImuNoise
+from torchspline.io.archive import write_bytes
 from torchspline.io.yaml import read_yaml, short
 
 _DENSITIES = (
@@ -154,7 +155,7 @@ def write_imu_parameters(
         lines.append(f"update_rate: {float(parameters.rate)!r}  # Hz")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file, got a folder")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def _float(x: float) -> str:

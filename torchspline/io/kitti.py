@@ -7,9 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchspline.groups.group import SO3
+from torchspline.io.archive import check_folder, write_bytes
 from torchspline.io.records import PoseRecord
 from torchspline.io.registry import Format
-from torchspline.io.text import Table, parse_seconds, read_table
+from torchspline.io.text import Table, format_seconds, parse_seconds, read_table, write_table
 
 _COLUMNS = tuple(f"{name}{row}" for row in "123" for name in ("r1", "r2", "r3", "t"))
 _TOLERANCE = 1e-4  # entries are printed with 7 digits
@@ -51,25 +53,65 @@ def read_poses(table: Table, times: Path | None = None) -> PoseRecord:
 def find_times(path: Path) -> Path:
     """The times file that belongs to a file of poses.
 
-    Tried in this order, each also gzipped: the same name with `gt` or `poses` replaced by `times`,
-    `times.txt` in the same folder, `../sequences/NAME/times.txt` as in the KITTI archive.
+    Tried in this order, each also gzipped: that of `times_beside`, `times.txt` in the same folder,
+    `../sequences/NAME/times.txt` as in the KITTI archive.
 
     Raises:
         FileNotFoundError: none of them exists.
     """
     name = path.name.removesuffix(".gz")
-    renamed = re.sub(r"(?<![A-Za-z])(gt|poses)(?![A-Za-z])", "times", name)
+    beside = times_beside(path)
     archive = path.parent.parent / "sequences" / Path(name).stem
-    candidates = [path.with_name(renamed)] if renamed != name else []
-    candidates += [path.with_name("times.txt"), archive / "times.txt"]
+    plain = beside.with_name(beside.name.removesuffix(".gz"))
+    candidates = [plain, path.with_name("times.txt"), archive / "times.txt"]
     for candidate in candidates:
-        for found in (candidate, candidate.with_name(candidate.name + ".gz")):
+        # What was written together is packed alike.
+        both = (candidate, candidate.with_name(candidate.name + ".gz"))
+        for found in both if plain == beside else both[::-1]:
             if found.is_file():
                 return found
     raise FileNotFoundError(
         f"{path}: KITTI poses need a file of stamps; pass times=PATH or provide one of "
         + ", ".join(map(str, candidates))
     )
+
+
+def times_beside(path: Path) -> Path:
+    """Where the stamps of a file of poses are written: `times` for `gt` or `poses` in its name, or behind it.
+
+    `poses.txt` goes with `times.txt`, `00_gt.txt` with `00_times.txt`, and `00.txt` with `00_times.txt` as well.
+    """
+    name, packed = path.name.removesuffix(".gz"), ".gz" if path.suffix == ".gz" else ""
+    renamed = re.sub(r"(?<![A-Za-z])(gt|poses)(?![A-Za-z])", "times", name)
+    if renamed == name:
+        renamed = f"{Path(name).stem}_times{Path(name).suffix}"
+    return path.with_name(renamed + packed)
+
+
+def write_poses(path: Path, record: PoseRecord, times: Path | None = None) -> None:
+    """Write a 3x4 matrix a line, row by row, and a line of decimal seconds for each into the file of stamps.
+
+    Both are gzipped where their names end with .gz. Rotations come back to rounding, as unit quaternions of either
+    sign; positions and stamps exactly.
+
+    Raises:
+        ValueError: stamps are to go into the file of the poses.
+    """
+    stamps = times or times_beside(path)
+    if stamps.resolve() == path.resolve():
+        raise ValueError(f"times: expected another file than that of the poses, got {stamps}")
+    matrices = torch.cat([_matrices(record.rotation), record.position[..., None]], -1).reshape(-1, 12)
+    check_folder(stamps)
+    write_table(path, "", (), matrices.detach().cpu().numpy(), " ")
+    write_bytes(stamps, "".join(f"{format_seconds(t)}\n" for t in record.time_ns.tolist()).encode())
+
+
+def _matrices(rotation: torch.Tensor) -> torch.Tensor:
+    """NaN where quaternions are not finite."""
+    finite = rotation.isfinite().all(-1)
+    found = rotation.new_full((len(rotation), 3, 3), float("nan"))
+    found[finite] = SO3.to_matrix(rotation[finite])
+    return found
 
 
 def _quaternions(table: Table, rotations: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,4 +133,4 @@ def _quaternions(table: Table, rotations: NDArray[np.float64]) -> NDArray[np.flo
     return result
 
 
-FORMAT = Format("kitti", recognises, read_poses=read_poses, separate_times=True)
+FORMAT = Format("kitti", recognises, read_poses=read_poses, write_poses=write_poses, separate_times=True)

@@ -19,10 +19,10 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.groups.convert import from_transform_matrix, to_transform_matrix
 from torchspline.groups.group import SO3
-from torchspline.io.archive import check_folder, read_bytes
+from torchspline.io.archive import check_folder, read_bytes, write_bytes
 from torchspline.io.records import PoseRecord
+from torchspline.units import SECOND
 
-_NS = 1_000_000_000
 _KINDS = ("camera_path", "transforms")
 #: A rotation from the axes here to theirs, on the right: half a turn about x.
 _HALF_TURN = (0.0, 1.0, 0.0, 0.0)
@@ -141,7 +141,7 @@ def write_nerfstudio(
                 for i, (matrix, time) in enumerate(zip(matrices, record.time.tolist(), strict=True))
             ],
         }
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -198,11 +198,11 @@ def _stamps(path: Path, content: dict[str, Any], frames: list[Any], fps: float |
         if rate <= 0:
             raise ValueError(f"{path}: fps: expected a number above zero, got {rate:g}")
         seconds = [i / rate for i in range(count)]
-    if max(map(abs, seconds)) > 2**63 / _NS * (1 - 1e-12):
+    if max(map(abs, seconds)) > 2**63 / SECOND * (1 - 1e-12):
         raise ValueError(
             f"{path}: expected times within the range of int64 nanoseconds, got {max(seconds, key=abs):g} s"
         )
-    return torch.tensor([round(x * _NS) for x in seconds], dtype=torch.int64)
+    return torch.tensor([round(x * SECOND) for x in seconds], dtype=torch.int64)
 
 
 def _number(path: Path, name: str, x: Any) -> float:
@@ -221,13 +221,13 @@ def _even_rate(record: PoseRecord) -> float:
     stamps = record.time_ns.cpu()
     step = float(stamps[-1] - stamps[0]) / (len(record) - 1)
     even = torch.arange(len(record), dtype=torch.float64) * step
-    off = (record.time.cpu() * _NS - even).abs()
+    off = (record.time.cpu() * SECOND - even).abs()
     if step <= 0 or bool((off > max(_EVEN * step, 1.0)).any()):
         raise ValueError(
-            f"record: expected evenly spaced stamps, got one that is off by {float(off.max()) / _NS:.3g} s at row "
+            f"record: expected evenly spaced stamps, got one that is off by {float(off.max()) / SECOND:.3g} s at row "
             f"{int(off.argmax())}; sample a trajectory at even times, or write kind='transforms'"
         )
-    rate = _NS / step
+    rate = SECOND / step
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
 

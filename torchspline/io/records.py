@@ -7,6 +7,8 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from torchspline.units import SECOND
+
 
 def _whole(name: str, x: int) -> int:
     try:
@@ -59,7 +61,7 @@ class _Record:
             if not len(self):
                 return self.time_ns.double()
             origin_ns = int(self.time_ns[0])
-        return (self.time_ns - _whole("origin_ns", origin_ns)).double() / 1e9
+        return (self.time_ns - _whole("origin_ns", origin_ns)).double() / SECOND
 
     @property
     def time(self) -> Tensor:

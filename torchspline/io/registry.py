@@ -17,18 +17,18 @@ class Format:
         recognises: whether a table looks like this format.
         read_poses: from a table and the path of the stamps (None unless `separate_times`).
         read_imu: from a table.
-        write_poses: to a path whose folder exists.
-        write_imu: to a path whose folder exists.
+        write_poses: to a path, and stamps to the other (None unless `separate_times`).
+        write_imu: to a path.
         pose_files: where poses lie in a folder of this format, first match first; each also gzipped.
         imu_files: the same for IMU samples.
-        separate_times: whether stamps come from a file of their own.
+        separate_times: whether stamps are in a file of their own.
     """
 
     name: str
     recognises: Callable[[Table], bool]
     read_poses: Callable[[Table, Path | None], PoseRecord] | None = None
     read_imu: Callable[[Table], ImuRecord] | None = None
-    write_poses: Callable[[Path, PoseRecord], None] | None = None
+    write_poses: Callable[[Path, PoseRecord, Path | None], None] | None = None
     write_imu: Callable[[Path, ImuRecord], None] | None = None
     pose_files: tuple[str, ...] = ()
     imu_files: tuple[str, ...] = ()

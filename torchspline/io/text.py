@@ -1,6 +1,5 @@
 """Tables of numbers in text files: reading with errors that name the line, exact stamps, writing."""
 
-import gzip
 import io
 import re
 from collections import Counter
@@ -12,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchspline.io.archive import read_bytes
+from torchspline.io.archive import read_bytes, write_bytes
+from torchspline.units import SECOND
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -45,7 +45,7 @@ def parse_seconds(field: str) -> int:
 
 def format_seconds(time_ns: int) -> str:
     """Decimal seconds with nine digits, exactly."""
-    whole, fraction = divmod(abs(time_ns), 10**9)
+    whole, fraction = divmod(abs(time_ns), SECOND)
     return f"{'-' if time_ns < 0 else ''}{whole}.{fraction:09d}"
 
 
@@ -181,15 +181,16 @@ def read_table(path: Path) -> Table:
 def write_table(
     path: Path, head: str, stamps: Iterable[str], values: NDArray[np.float64], separator: str
 ) -> None:
-    """Write a header line, then a stamp and numbers a line, with the digits that give back the same float64.
+    """Write a header, if there is one, then a stamp and numbers a line, with digits that give back the same float64.
+
+    Without stamps, numbers alone.
 
     Gzipped when the name ends with .gz. Raises `FileNotFoundError` where the folder does not exist.
     """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
-    rows = (separator.join([t, *map(repr, row)]) for t, row in zip(stamps, values.tolist(), strict=True))
-    content = "\n".join([head, *rows, ""]).encode()
-    path.write_bytes(gzip.compress(content, compresslevel=6, mtime=0) if path.suffix == ".gz" else content)
+    numbers = (separator.join(map(repr, row)) for row in values.tolist())
+    first = list(stamps)
+    rows = map(separator.join, zip(first, numbers, strict=True)) if first else numbers
+    write_bytes(path, "\n".join([*([head] if head else []), *rows, ""]).encode())
 
 
 def _is_number(field: str) -> bool:

@@ -28,6 +28,7 @@ from torchspline.splines import (
     Trajectory,
 )
 from torchspline.splines.trajectory import Mounted
+from torchspline.units import SECOND
 
 _FORMAT, _VERSION = "torchspline trajectory", 1
 _DTYPES = {np.dtype(x) for x in ("float32", "float64", "int64")}
@@ -107,6 +108,27 @@ def load_trajectory(path: str | PathLike[str]) -> Trajectory:
     except (TypeError, ValueError, KeyError, RecursionError, OverflowError, RuntimeError) as reason:
         text = " ".join(str(reason).split())[:300]
         raise ValueError(f"{path}: expected a {_FORMAT}, got {text}") from None
+
+
+def even_times(trajectory: Trajectory, rate: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Times of a trajectory, `rate` a second from its start, as it takes them (s or ns) and as whole nanoseconds.
+
+    Raises:
+        ValueError: no rate, or so high a one that there would be more than 1e8 times.
+    """
+    if not 0 < rate < float("inf"):
+        raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
+    first, last = trajectory.domain
+    nanoseconds = isinstance(first, int)
+    span = (last - first) / (SECOND if nanoseconds else 1)
+    if span * rate > 1e8:
+        raise ValueError(f"rate: {rate:g} Hz over {span:g} s makes more than 1e8 times")
+    steps = torch.arange(int(span * rate + 1e-9) + 1, dtype=torch.float64) / rate
+    stamps = (steps * SECOND).round().to(torch.int64)
+    if nanoseconds:
+        t = first + stamps.clamp(max=last - first)
+        return t, t
+    return (first + steps).clamp(first, last), round(first * SECOND) + stamps
 
 
 def _describe(trajectory: Any, arrays: dict[str, NDArray[Any]], prefix: str) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def read_poses(table: Table, times: Path | None = None) -> PoseRecord:
     )
 
 
-def write_poses(path: Path, record: PoseRecord) -> None:
+def write_poses(path: Path, record: PoseRecord, times: Path | None = None) -> None:
     """Write a TUM file with nine digits of seconds, gzipped when the name ends with .gz."""
     xyzw = record.rotation[:, [1, 2, 3, 0]]
     values = np.hstack([column.detach().cpu().numpy() for column in (record.position, xyzw)])

@@ -15,7 +15,7 @@ import numpy as np
 from torchspline.kernels.build import compiled
 from torchspline.kernels.rowwise import Array
 
-_HEADER = '''"""Loops of torchspline/kernels/assemble.py."""
+HEADER = '''"""Loops of torchspline/kernels/assemble.py."""
 
 import numpy as np
 from numba import njit
@@ -25,8 +25,8 @@ FEW = {FEW}
 
 '''
 _OPTIONS = 'nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}'
-_ENTRY = '@njit("{signature}", cache={cache}, ' + _OPTIONS + ")\n"
-_HELPER = f"@njit({_OPTIONS})\n"
+ENTRY = '@njit("{signature}", cache={cache}, ' + _OPTIONS + ")\n"
+HELPER = f"@njit({_OPTIONS})\n"
 
 
 #: Rows of a run that are multiplied at a time.
@@ -235,9 +235,9 @@ _SIGNATURES = {
 def fast(loop: Callable) -> Callable:
     """The compiled form of one of the loops above."""
     name = loop.__name__
-    helpers = [_HELPER + inspect.getsource(f) for f in (outer_products, to_points, workspace, run_gram)]
-    source = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", str(FEW)) + "\n\n".join(
-        [*helpers, _ENTRY + inspect.getsource(loop)]
+    helpers = [HELPER + inspect.getsource(f) for f in (outer_products, to_points, workspace, run_gram)]
+    source = HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", str(FEW)) + "\n\n".join(
+        [*helpers, ENTRY + inspect.getsource(loop)]
     )
     return compiled(name, source, _SIGNATURES[name])
 

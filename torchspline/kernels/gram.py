@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from torchspline.kernels.assemble import _ENTRY, _HEADER, _HELPER, DEPTH, outer_products
+from torchspline.kernels.assemble import DEPTH, ENTRY, HEADER, HELPER, outer_products
 from torchspline.kernels.build import compiled
 from torchspline.kernels.rowwise import Array
 
@@ -64,9 +64,9 @@ _SIGNATURE = "void(float64[:, :, ::1], int64[::1], float64[::1], int64, int64, f
 @cache
 def _compiled() -> Callable:
     helper, loop = (inspect.getsource(f) for f in (outer_products, to_triangles))
-    header = _HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", "0").replace("assemble.py", "gram.py")
+    header = HEADER.replace("{DEPTH}", str(DEPTH)).replace("{FEW}", "0").replace("assemble.py", "gram.py")
     header = header.rstrip() + f"\nLEAST_PIVOT = {LEAST_PIVOT}\n\n"
-    return compiled("to_triangles", f"{header}\n{_HELPER}{helper}\n\n{_ENTRY}{loop}", _SIGNATURE)
+    return compiled("to_triangles", f"{header}\n{HELPER}{helper}\n\n{ENTRY}{loop}", _SIGNATURE)
 
 
 def triangles(fused: bool, rows: Array, starts: Array, weight: Array) -> Array:

@@ -16,6 +16,7 @@ from torchspline.kernels import emit, programs
 from torchspline.kernels.build import compiled
 from torchspline.kernels.rowwise import Array, RowKernel
 from torchspline.kernels.threads import SERIAL_BELOW, run, spans
+from torchspline.units import NANOSECOND
 
 #: Queries a chunk of the reverse sweep. Chunks are summed in order whatever the number of threads, so that gradients
 #: are the same to the last bit.
@@ -193,7 +194,7 @@ class SplineKernels:
         return gradient
 
     def _scale(self, clock: Clock) -> Array:
-        return _scale(clock.dt * 1e-9 if self.nanoseconds else clock.dt, self.derivatives, self.real)
+        return _scale(clock.dt * NANOSECOND if self.nanoseconds else clock.dt, self.derivatives, self.real)
 
     # ------------------------------------------------------------------ compilation
 

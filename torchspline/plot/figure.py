@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchspline import checks
 from torchspline.splines import Kinematics, Trajectory
+from torchspline.units import NANOSECOND
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,7 +97,7 @@ def motion_of(trajectory: Trajectory, t: Tensor | None) -> Motion:
             f"trajectories: expected single trajectories, got a batch of {tuple(some.shape[:-2])}"
         )
     if t.dtype == torch.int64:
-        return Motion(numbers(t - t[0]) * 1e-9, found, "time since start [s]")
+        return Motion(numbers(t - t[0]) * NANOSECOND, found, "time since start [s]")
     return Motion(numbers(t), found, "time [s]")
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchspline import checks
 from torchspline.fit import PoseFit
 from torchspline.plot.figure import AXES, AXIS_COLORS, new_figure, numbers
+from torchspline.units import NANOSECOND
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +55,7 @@ def residuals(
                 f"fit[{name!r}]: expected shape ({len(t)},) or ({len(t)}, C), got {tuple(x.shape)}"
             )
     nanoseconds = t.dtype == torch.int64
-    seconds = numbers(t - t[0]) * 1e-9 if nanoseconds else numbers(t)
+    seconds = numbers(t - t[0]) * NANOSECOND if nanoseconds else numbers(t)
     figure = new_figure(11, 0.6 + 2.4 * len(fit))
     panels = figure.subplots(len(fit), 2, squeeze=False, width_ratios=[3, 1], sharey="row")
     for (over, spread), (name, x) in zip(panels, fit.items(), strict=True):

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchspline import checks
-from torchspline.fit.banded import difference_band, gram_band, solve_band, transpose_apply
-from torchspline.fit.knots import Knots
+from torchspline.fit.poses.banded import difference_band, gram_band, solve_band, transpose_apply
+from torchspline.fit.poses.knots import Knots
 from torchspline.groups.group import Rn
 from torchspline.splines.basis import blending_matrix, derivative_matrix
 from torchspline.splines.bspline import BSpline
+from torchspline.units import SECOND, unit_of
 
 Array = NDArray[np.float64]
 #: Spacings that are tried: factor between them, samples a knot interval at least, knot intervals at least.
@@ -151,7 +152,7 @@ def _rows(knots: Knots, times: Tensor, derivative: int, late: float = 0.0) -> tu
     """First control point and weights (N, k) of a derivative per second, zeros where late ones are outside."""
     if late:
         start, stop = knots.t0, knots.t0 + knots.segments * knots.dt
-        shifted = times - (round(late * 1e9) if knots.nanoseconds else late)
+        shifted = times - (round(late * SECOND) if knots.nanoseconds else late)
         inside = ((shifted >= start) & (shifted <= stop)).numpy()
         times = shifted.clamp(start, stop)
     first, u = knots.place(times)
@@ -244,7 +245,7 @@ def _solve_bending(band: Array, bends: Array, right: Array) -> Array:
 
 def _choose(times: Tensor, data: Sequence[_Data], order: int) -> float:
     """The spacing of least generalised cross-validation: `sum over joints of log(rest / (1 - p / n)^2)`."""
-    unit = 1e-9 if times.dtype == torch.int64 else 1.0
+    unit = unit_of(times)
     steps = times.diff().to(torch.float64)
     steps = steps[steps > 0] * unit
     spacing = _LEAST_SAMPLES * float(steps.median())

@@ -240,6 +240,8 @@ class Robot:
     def over_limits(self, joints: Trajectory, t: Tensor) -> list[OverLimit]:
         """Joints that leave their limits of position or velocity at the times `t`, the worst of each; empty is good.
 
+        Joints that mimic others come after those: their own limits hold for `factor q + offset` of the one they mimic.
+
         Raises:
             TypeError, ValueError: not a trajectory in R^dof, or times that it does not take.
         """
@@ -248,8 +250,9 @@ class Robot:
             state = joints.evaluate(t, derivatives=1)
         assert state.velocity is not None
         found = []
-        for i, joint in enumerate(self.joints):
-            q, rate = state.value[..., i], state.velocity[..., i].abs()
+        for joint, i, factor, offset in self._limited():
+            q = factor * state.value[..., i] + offset
+            rate = abs(factor) * state.velocity[..., i].abs()
             for quantity, value, limit, over in (
                 ("position", q, joint.lower, joint.lower - q),
                 ("position", q, joint.upper, q - joint.upper),
@@ -266,6 +269,13 @@ class Robot:
                     )
                 )
         return found
+
+    def _limited(self) -> list[tuple[Joint, int, float, float]]:
+        """All joints, with the coordinate that moves each, factor and offset."""
+        names = self.joint_names
+        moves = [move for frame in self._frames.values() for move in frame.moves]
+        mimics = [(x.mimic, names.index(x.joint), x.factor, x.offset) for x in moves if x.mimic is not None]
+        return [*((joint, i, 1.0, 0.0) for i, joint in enumerate(self.joints)), *mimics]
 
     def _check_joints(self, joints: Any) -> None:
         checks.instance("joints", joints, Trajectory, "a Trajectory such as BSpline(..., group=Rn(dof))")

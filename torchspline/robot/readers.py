@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchspline.robot.bounds import check_mjcf
+
 Array = NDArray[np.float64]
 _NONE = math.inf
 #: What says in which encoding XML is.
@@ -43,6 +45,8 @@ class Move(NamedTuple):
     screw: Array
     factor: float = 1.0
     offset: float = 0.0
+    #: The joint that stands here, where it mimics that one: its limits are of what it does itself.
+    mimic: Joint | None = None
 
 
 class Frame(NamedTuple):
@@ -101,7 +105,7 @@ def naming(source: str | PathLike[str]) -> Iterator[None]:
         text = " ".join(str(reason).split())
         is_text = isinstance(source, str) and source.lstrip().startswith("<")
         if not is_text and str(source) not in text:
-            text = text.replace("source: ", f"source: {source}: ", 1)
+            text = f"source: {source}: {text.removeprefix('source: ')}"
         raise ValueError(text if len(text) <= 500 else f"{text[:497]}...") from None
 
 
@@ -152,7 +156,8 @@ def _urdf_tree(robot: Any) -> tuple[list[Joint], list[Frame]]:
             driver, factor, offset = sources[joint.name]
             if driver == joint.name:
                 joints.append(own)
-            move = (Move(driver, _urdf_screw(joint), factor, offset),)
+            mimic = own if driver != joint.name else None
+            move = (Move(driver, _urdf_screw(joint), factor, offset, mimic),)
         pose = _origin(joint.origin)
         if not np.isfinite(pose).all():
             raise ValueError(
@@ -241,13 +246,18 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
         raise ImportError("MJCF files need MuJoCo's parser: pip install 'torchspline[mjcf]'") from None
     name, text = content(source)
     try:
+        check_mjcf(text)
         model = mujoco.MjModel.from_xml_string(text.decode(errors="replace"))
-    except ValueError as reason:
+    except (ValueError, RuntimeError, mujoco.FatalError, mujoco.UnexpectedError) as reason:
         raise ValueError(
             f"source: expected an MJCF model in {name}, got one that cannot be read: {reason}"
         ) from None
     kinds = {mujoco.mjtJoint.mjJNT_HINGE: "revolute", mujoco.mjtJoint.mjJNT_SLIDE: "prismatic"}
     joints, frames = [], []
+
+    def called(b: int) -> str:
+        return model.body(b).name or f"body{b}"
+
     for b in range(model.nbody):
         body, moves = model.body(b), []
         for j in range(int(body.jntadr[0]), int(body.jntadr[0]) + int(body.jntnum[0])):
@@ -262,18 +272,26 @@ def from_mjcf(source: str | PathLike[str]) -> tuple[list[Joint], list[Frame]]:
             # Poses hold where the joint stands at its reference.
             reference = float(model.qpos0[int(joint.qposadr[0])])
             moves.append(Move(joints[-1].name, screw(kind, joint.axis, joint.pos), 1.0, -reference))
-        parent = None if b == 0 else model.body(int(body.parentid[0])).name
-        frames.append(Frame(body.name, parent, transform(body.pos, _matrix(body.quat)), tuple(moves)))
+        parent = None if b == 0 else called(int(body.parentid[0]))
+        frames.append(Frame(called(b), parent, transform(body.pos, _matrix(body.quat)), tuple(moves)))
     for s in range(model.nsite):
         site = model.site(s)
-        on = model.body(int(site.bodyid[0])).name
+        on = called(int(site.bodyid[0]))
         frames.append(Frame(site.name or f"site{s}", on, transform(site.pos, _matrix(site.quat))))
+    for frame in frames:
+        numbers = [frame.pose, *(np.append(move.screw, move.offset) for move in frame.moves)]
+        if not all(np.isfinite(x).all() for x in numbers):
+            raise ValueError(
+                f"source: {frame.name!r} has a pose or joint that is not finite; expected numbers"
+            )
     return joints, frames
 
 
 def _matrix(q: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
+    if not 0 < np.linalg.norm(q) < math.inf:  # MuJoCo normalises; numbers at the edge are left as they are
+        raise ValueError(f"source: expected rotations, got the quaternion {q}")
     return Rotation.from_quat(np.roll(q, -1)).as_matrix()
 
 

@@ -1,6 +1,6 @@
 """Any sensor of a rigid body on a link of a robot: the sensor's own residual after the chain of joints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -9,7 +9,7 @@ from torchspline.arithmetic.recurrence import Step, forward, reverse
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.scalar import Scalar
 from torchspline.arithmetic.vector import Vector, plus, times
-from torchspline.fit.residual import Moment, Residual
+from torchspline.fit.residual import Cotangents, Given, Moment, Residual
 from torchspline.groups.group import Group
 
 
@@ -62,18 +62,13 @@ def on_link(
                 )
 
         def evaluate(
-            self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+            self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
         ) -> Vector:
             return sensor.evaluate(se3, [chain(moment)[1] for moment in at], given, measured)
 
         def reverse(
-            self,
-            group: GroupArithmetic,
-            at: Sequence[Moment],
-            given: Mapping[str, Vector],
-            measured: Vector,
-            g: Vector,
-        ) -> tuple[list[Moment], dict[str, Vector]]:
+            self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+        ) -> tuple[list[Moment], Cotangents]:
             chains = [chain(moment) for moment in at]
             links_g, given_g = sensor.reverse(se3, [state for _, state, _ in chains], given, measured, g)
             joints_g = []

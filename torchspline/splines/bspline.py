@@ -16,8 +16,7 @@ from torchspline.splines.jacobians import Jacobians, bspline_jacobians
 from torchspline.splines.segments import past_the_end
 from torchspline.splines.sweep import cumulative_bspline
 from torchspline.splines.trajectory import State, Trajectory
-
-_NANOSECOND = 1e-9
+from torchspline.units import unit_of
 
 
 def bspline(
@@ -82,7 +81,7 @@ def bspline(
         fields = cumulative_bspline(control_points, u, place.segment, group.name, order, needed)
         if place.beyond is not None:
             fields = past_the_end(group, fields, place.beyond.to(u.dtype), extrapolate)
-        seconds = spacing * _NANOSECOND if times.dtype == torch.int64 else spacing
+        seconds = spacing * unit_of(times)
         return tuple(
             field if r == 0 else field / seconds**r for r, field in enumerate(fields[: derivatives + 1])
         )
@@ -337,7 +336,7 @@ class BSpline(Trajectory):
             if times.dtype != torch.int64:
                 checks.finite("t", times)
             place = locate(times, start, spacing, points.shape[-2] - self.order + 1, "error", True)
-            seconds = spacing * _NANOSECOND if times.dtype == torch.int64 else spacing
+            seconds = spacing * unit_of(times)
             result = bspline_jacobians(
                 points, place.segment, place.u, self.group, self.order, float(seconds), derivatives, side
             )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchspline import checks
+from torchspline import checks, units
 from torchspline.arithmetic.recurrence import MAX_DERIVATIVES
 from torchspline.groups.group import Group
 from torchspline.splines.clock import EXTRAPOLATE, Extrapolate
@@ -19,15 +19,12 @@ from torchspline.splines.trajectory import State
 Fields = Callable[[Tensor, Tensor, int], tuple[Tensor, ...]]
 
 
-#: Knots in whole nanoseconds (int64) are told apart and subtracted as integers, so that an epoch costs no digits.
-NANOSECOND = 1e-9
-
-
 def durations(times: Tensor) -> Tensor:
-    """Seconds between neighbouring `times`, float64; int64 times are nanoseconds."""
-    if times.dtype == torch.int64:
-        return times.diff().to(torch.float64) * NANOSECOND
-    return times.to(torch.float64).diff()
+    """Seconds between neighbouring `times`, float64.
+
+    Knots in whole nanoseconds are subtracted as integers, so that an epoch costs no digits, and others in float64.
+    """
+    return units.seconds((times if times.dtype == torch.int64 else times.to(torch.float64)).diff())
 
 
 class Place(NamedTuple):
@@ -112,7 +109,7 @@ def locate_between(t: Tensor, times: Tensor, extrapolate: Extrapolate, validate:
     duration = steps[segment].to(torch.float64)
     u = (s - knots[segment]).to(torch.float64) / duration
     if nanoseconds:
-        duration = duration * NANOSECOND
+        duration = duration * units.NANOSECOND
     # A few rounding errors beyond the ends belong to the domain.
     ends = knots.detach()
     slack = 0 if nanoseconds else rounding(t.dtype) * (ends.abs().amax() + ends[-1] - ends[0])

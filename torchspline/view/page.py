@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from torchspline import checks
+from torchspline.io.archive import check_folder, write_bytes
 from torchspline.plot.figure import named, times_of
 from torchspline.splines import Trajectory
+from torchspline.units import SECOND
 
 #: Directions that can point up in a view.
 UP = ("x", "y", "z", "-x", "-y", "-z")
@@ -73,10 +75,8 @@ def write_page(
     """
     if not isinstance(path, (str, PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
-    path.write_text(page(trajectories, **options), encoding="utf-8")
+    check_folder(Path(path))
+    write_bytes(Path(path), page(trajectories, **options).encode())
 
 
 def _curve(name: str, trajectory: Trajectory, samples: int) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _curve(name: str, trajectory: Trajectory, samples: int) -> dict[str, Any]:
         raise ValueError(
             f"trajectories: expected single trajectories, got a batch of {tuple(motion.position.shape[:-2])}"
         )
-    seconds = (t - t[0]).double() / 1e9 if t.dtype == torch.int64 else t
+    seconds = (t - t[0]).double() / SECOND if t.dtype == torch.int64 else t
     curve: dict[str, Any] = {
         "name": name,
         "t": seconds.tolist(),

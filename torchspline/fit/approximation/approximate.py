@@ -66,6 +66,8 @@ def approximate(
 
     A smooth motion is met to the order of a B-spline on R^n, but to third order at most where its factors do not
     commute (measured, whatever the control points); a Hermite spline in logarithmic coordinates is of sixth order.
+    From SE3 to R3xSO3 over the same knots rotations are met to rounding, as they are B-splines in SO3 in both, unless
+    neighbouring control points are more than a radian apart; positions, which SE3 couples to them, are fitted.
 
     Args:
         trajectory: any; batches share the knots, and all of them count.

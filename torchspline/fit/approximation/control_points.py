@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchspline.fit.approximation.compare import union, within
 from torchspline.fit.approximation.source import Source
-from torchspline.fit.banded import gram_band, transpose_apply
+from torchspline.fit.poses.banded import gram_band, transpose_apply
 from torchspline.groups.components import split
+from torchspline.groups.group import Group
 from torchspline.splines.keyframes import consistent_signs
 from torchspline.splines.nonuniform import basis, local_knots, nonuniform_bspline
 from torchspline.splines.segments import locate_between
@@ -18,7 +19,7 @@ from torchspline.splines.segments import locate_between
 #: Steps at most; each takes off most of the miss that knots allow to take off, more of it the nearer knots are.
 _STEPS = 60
 #: So many steps in a row that leave more than this share of the least miss so far end it: that is what knots leave.
-_STALLED, _IN_A_ROW = 0.97, 4
+_STALLED, _IN_A_ROW = 0.97, 8
 #: Steps that are remembered to speed up the next ones.
 _REMEMBERED = 12
 
@@ -39,6 +40,9 @@ def control_points(source: Source, knots: Tensor, order: int) -> Tensor:
     world's side, are met by the same linear fit, and its coefficients move the control points, `Exp(c_j) X_j`, until
     only what the basis cannot follow is left: as the basis functions sum to one, a miss that is the same everywhere
     is met at once, whatever the group, and the rest as fast as neighbours commute. Cost is linear in knots.
+
+    Factors of a direct product are met each by itself, so that one that the basis cannot follow does not hide what is
+    left of another: the rotation of a B-spline in SE3 is one in SO3, its position no B-spline.
     """
     group, count = source.group, len(knots) - order
     domain = knots[order - 1 : count + 1]
@@ -58,10 +62,25 @@ def control_points(source: Source, knots: Tensor, order: int) -> Tensor:
     points = source.values(greville(knots, order, start, end))
     if group.arithmetic.unit_blocks:
         points = consistent_signs(points, group)
+    factors = getattr(group.arithmetic, "factors", (group.arithmetic,))
+    sizes = [factor.point_size for factor in factors]
+    met = [
+        _followed(Group(factor.name), x, y, t, knots, order, solve)
+        for factor, x, y in zip(factors, goal.split(sizes, -1), points.split(sizes, -1), strict=True)
+    ]
+    return torch.cat(met, dim=-1)
+
+
+def _followed(
+    group: Group, goal: Tensor, points: Tensor, t: Tensor, knots: Tensor, order: int, solve: "_Solver"
+) -> Tensor:
+    """Control points, from a first guess, of the B-spline that follows `goal` at times `t`."""
+    count, density = points.shape[-2], solve.density[:, 0]
     base, mixing = points, _Mixing()
     moved: NDArray[np.float64] | None = None
     best, least, stalled = points, np.inf, 0
-    for _ in range(_STEPS):
+    # On R^n the first step is the solution, others refine its rounding.
+    for _ in range(_STEPS if group.arithmetic.unit_blocks else _IN_A_ROW):
         with torch.no_grad():
             value = nonuniform_bspline(
                 points, t, group=group, knots=knots, order=order, derivatives=0, validate=False

@@ -1,4 +1,4 @@
-"""All residuals. A new one is one file in this folder and one line here."""
+"""All residuals. A new one is a file in this folder, imported and named here; `torchspline.fit` has them all."""
 
 from torchspline.fit.residual import Residual
 from torchspline.fit.residuals.accelerometer import Accelerometer
@@ -13,25 +13,24 @@ from torchspline.fit.residuals.reprojection import ReprojectionEquidistant, Repr
 from torchspline.fit.residuals.state import StateAcceleration, StateJerk, StateValue, StateVelocity
 from torchspline.fit.residuals.velocity import BodyVelocity, WorldVelocity
 
-RESIDUALS: dict[str, type[Residual]] = {
-    kind.__name__: kind
-    for kind in (
-        Accelerometer,
-        AngularAcceleration,
-        BodyVelocity,
-        Direction,
-        Gyroscope,
-        Orientation,
-        Point,
-        Pose,
-        Position,
-        RelativePose,
-        ReprojectionEquidistant,
-        ReprojectionRadtan,
-        StateAcceleration,
-        StateJerk,
-        StateValue,
-        StateVelocity,
-        WorldVelocity,
-    )
-}
+__all__ = [
+    "Accelerometer",
+    "AngularAcceleration",
+    "BodyVelocity",
+    "Direction",
+    "Gyroscope",
+    "Orientation",
+    "Point",
+    "Pose",
+    "Position",
+    "RelativePose",
+    "ReprojectionEquidistant",
+    "ReprojectionRadtan",
+    "StateAcceleration",
+    "StateJerk",
+    "StateValue",
+    "StateVelocity",
+    "WorldVelocity",
+]
+
+RESIDUALS: dict[str, type[Residual]] = {name: globals()[name] for name in __all__}

@@ -1,48 +1,31 @@
 """Measured rates of rotation: what a gyroscope on the body reads, and the derivative of that."""
 
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import MOTIONS, Motion
+from torchspline.arithmetic.motion import Motion
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import Moment, Residual, needs
+from torchspline.fit.residual import Cotangents, Given
+from torchspline.fit.residuals.motion import MotionResidual
 from torchspline.fit.residuals.triad import TRIAD, reading, reading_reverse
-from torchspline.groups.group import Group
 
 
-class _AngularRate(Residual):
+class _AngularRate(MotionResidual):
     """`S R^T x + b - measured` for a field x of the body's `Motion`."""
 
     rows, measured_size = 3, 3
+    moves = False
     slots = TRIAD
     #: Name of the field.
     rate: ClassVar[str]
 
-    @classmethod
-    def check_group(cls, group: Group) -> None:
-        needs(cls.__name__, group, rotates=True)
-
-    def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
-    ) -> Vector:
-        motion = MOTIONS[group.name].motion(at[0].value, at[0].rates)
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(reading(given, getattr(motion, self.rate)), negate(measured))
 
-    def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
-        mechanics = MOTIONS[group.name]
-        motion = mechanics.motion(at[0].value, at[0].rates)
+    def error_reverse(
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         rate_g, cotangents = reading_reverse(given, getattr(motion, self.rate), g)
-        motion_g = Motion(**{self.rate: rate_g})
-        value_g, rates_g = mechanics.reverse(at[0].value, at[0].rates, motion, motion_g)
-        return [Moment(value_g, tuple(rates_g))], cotangents
+        return Motion(**{self.rate: rate_g}), cotangents
 
 
 class Gyroscope(_AngularRate):

@@ -1,15 +1,14 @@
 """A landmark whose place a sensor measures in three dimensions: depth cameras, lidar, beacons."""
 
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
+from torchspline.arithmetic.motion import Motion, sighted, sighted_reverse
 from torchspline.arithmetic.vector import Vector, add, negate
-from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual, Slot
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given, Slot
+from torchspline.fit.residuals.motion import MotionResidual
 
 
-class Point(Residual):
+class Point(MotionResidual):
     """`T_body_sensor^-1 T_body^-1 landmark - measured`, m, in the frame of the sensor.
 
     Arguments:
@@ -23,22 +22,11 @@ class Point(Residual):
         "T_body_sensor": POSE_IN_BODY,
     }
 
-    def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
-    ) -> Vector:
-        motion = MOTIONS[group.name].motion(at[0].value, ())
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
         return add(sighted(motion, given["T_body_sensor"], given["landmark"]), negate(measured))
 
-    def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
-        mechanics = MOTIONS[group.name]
-        motion = mechanics.motion(at[0].value, ())
+    def error_reverse(
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
         motion_g, T_g, landmark_g = sighted_reverse(motion, given["T_body_sensor"], given["landmark"], g)
-        value_g, _ = mechanics.reverse(at[0].value, (), motion, motion_g)
-        return [Moment(value_g, ())], {"landmark": landmark_g, "T_body_sensor": T_g}
+        return motion_g, {"landmark": landmark_g, "T_body_sensor": T_g}

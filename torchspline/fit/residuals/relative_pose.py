@@ -1,6 +1,6 @@
 """A measured motion between two times: visual or lidar odometry, loop closures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 from torchspline.arithmetic.group import GroupArithmetic
@@ -8,7 +8,7 @@ from torchspline.arithmetic.motion import MOTIONS, Motion
 from torchspline.arithmetic.registry import arithmetic
 from torchspline.arithmetic.so3 import conjugate, multiply, rotate, unit, unrotate
 from torchspline.arithmetic.vector import Vector, add, cross, negate
-from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given, Moment, Residual
 
 
 class RelativePose(Residual):
@@ -26,7 +26,7 @@ class RelativePose(Residual):
     slots: ClassVar = {"T_body_sensor": POSE_IN_BODY}
 
     def _between(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector]
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given
     ) -> tuple[list[Motion], Vector]:
         """Motion of the body at both times, and the pose of the second sensor in the first."""
         motions, poses = [MOTIONS[group.name].motion(x.value, ()) for x in at], arithmetic("SE3")
@@ -34,20 +34,15 @@ class RelativePose(Residual):
         return motions, poses.between(first, second)
 
     def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector
     ) -> Vector:
         _, between = self._between(group, at, given)
         error = multiply(conjugate(unit(measured[3:])), between[3:])
         return (*add(between[:3], negate(measured[:3])), *arithmetic("SO3").log(error))
 
     def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
+        self, group: GroupArithmetic, at: Sequence[Moment], given: Given, measured: Vector, g: Vector
+    ) -> tuple[list[Moment], Cotangents]:
         motions, between = self._between(group, at, given)
         p, q, T = between[:3], between[3:], given["T_body_sensor"]
         error = self.evaluate(group, at, given, measured)[3:]

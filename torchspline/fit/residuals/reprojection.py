@@ -1,81 +1,46 @@
 """Where a camera sees a landmark, in pixels."""
 
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-from torchspline.arithmetic.group import GroupArithmetic
-from torchspline.arithmetic.motion import MOTIONS, sighted, sighted_reverse
-from torchspline.arithmetic.scalar import Scalar, sqrt, where
-from torchspline.arithmetic.series import arctan_factor
-from torchspline.arithmetic.vector import Vector, add, dot, negate, scale, times
-from torchspline.fit.residual import POSE_IN_BODY, Moment, Residual, Slot
-
-#: (tan 89.94 degrees)^-2: a pinhole sees nothing that lies so far aside.
-_ASIDE = 1e-6
-#: (cos 170 degrees)^2: nor does a fisheye what lies so far behind.
-_BEHIND = 0.97
+from torchspline.arithmetic.camera import CAMERA_MODELS, CameraModel
+from torchspline.arithmetic.motion import Motion, sighted, sighted_reverse
+from torchspline.arithmetic.vector import Vector, add, negate, scale, times
+from torchspline.fit.residual import POSE_IN_BODY, Cotangents, Given, Slot
+from torchspline.fit.residuals.motion import MotionResidual
 
 
-class _Reprojection(Residual):
+class _Reprojection(MotionResidual):
+    """What the models of cameras share; a new one is a class in `arithmetic/camera.py` and one here."""
+
     rows, measured_size, derivatives = 2, 2, 0
     slots: ClassVar = {
         "landmark": Slot(3, None, None),
         "intrinsics": Slot(8, None, None),
         "T_body_camera": POSE_IN_BODY,
     }
+    camera: ClassVar[CameraModel]
 
-    @staticmethod
-    @abstractmethod
-    def _visible(point: Vector) -> tuple[Vector, Scalar]:
-        """The point, another one in its place where it cannot be seen, and 1, or 0 where it cannot."""
+    def error(self, motion: Motion, given: Given, measured: Vector) -> Vector:
+        intrinsics = given["intrinsics"]
+        point, shown = self.camera.visible(sighted(motion, given["T_body_camera"], given["landmark"]))
+        x, y = self.camera.distort(point, intrinsics[4:])
+        pixel = (times(intrinsics[0], x), times(intrinsics[1], y))
+        return scale(shown, add(pixel, intrinsics[2:4], negate(measured)))
 
-    @staticmethod
-    @abstractmethod
-    def _distort(point: Vector, k: Vector) -> Vector:
-        """From a point (x, y, z) in the frame of the camera to the image plane at focal length one."""
-
-    @staticmethod
-    @abstractmethod
-    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
-        """Cotangents of the point and of the coefficients."""
-
-    def evaluate(
-        self, group: GroupArithmetic, at: Sequence[Moment], given: Mapping[str, Vector], measured: Vector
-    ) -> Vector:
-        motion, camera = MOTIONS[group.name].motion(at[0].value, ()), given["intrinsics"]
-        seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self._visible(seen)
-        x, y = self._distort(point, camera[4:])
-        pixel = (times(camera[0], x), times(camera[1], y))
-        return scale(shown, add(pixel, camera[2:4], negate(measured)))
-
-    def reverse(
-        self,
-        group: GroupArithmetic,
-        at: Sequence[Moment],
-        given: Mapping[str, Vector],
-        measured: Vector,
-        g: Vector,
-    ) -> tuple[list[Moment], dict[str, Vector]]:
-        mechanics, camera = MOTIONS[group.name], given["intrinsics"]
-        motion = mechanics.motion(at[0].value, ())
-        seen = sighted(motion, given["T_body_camera"], given["landmark"])
-        point, shown = self._visible(seen)
-        x, y = self._distort(point, camera[4:])
+    def error_reverse(
+        self, motion: Motion, given: Given, measured: Vector, g: Vector
+    ) -> tuple[Motion, Cotangents]:
+        intrinsics = given["intrinsics"]
+        point, shown = self.camera.visible(sighted(motion, given["T_body_camera"], given["landmark"]))
+        x, y = self.camera.distort(point, intrinsics[4:])
         gu, gv = scale(shown, g)
-        plane_g = (times(camera[0], gu), times(camera[1], gv))
-        point_g, k_g = self._distort_reverse(point, camera[4:], plane_g)
+        plane_g = (times(intrinsics[0], gu), times(intrinsics[1], gv))
+        point_g, k_g = self.camera.distort_reverse(point, intrinsics[4:], plane_g)
         motion_g, T_g, landmark_g = sighted_reverse(
             motion, given["T_body_camera"], given["landmark"], point_g
         )
-        value_g, _ = mechanics.reverse(at[0].value, (), motion, motion_g)
         intrinsics_g = (times(x, gu), times(y, gv), gu, gv, *k_g)
-        return [Moment(value_g, ())], {
-            "landmark": landmark_g,
-            "intrinsics": intrinsics_g,
-            "T_body_camera": T_g,
-        }
+        return motion_g, {"landmark": landmark_g, "intrinsics": intrinsics_g, "T_body_camera": T_g}
 
 
 class ReprojectionRadtan(_Reprojection):
@@ -92,41 +57,7 @@ class ReprojectionRadtan(_Reprojection):
             the body, SE3. A rolling shutter is a matter of the `clock`: its `delay` and `late`.
     """
 
-    @staticmethod
-    def _visible(point: Vector) -> tuple[Vector, Scalar]:
-        x, y, z = point
-        behind = (z < 1e-12) | (z * z < _ASIDE * dot((x, y), (x, y)))
-        return (x, y, where(behind, 1.0, z)), where(behind, z - z, 1.0)
-
-    @staticmethod
-    def _distort(point: Vector, k: Vector) -> Vector:
-        a, b, k1, k2, p1, p2 = point[0] / point[2], point[1] / point[2], *k
-        r2, ab = a * a + b * b, 2.0 * (a * b)
-        c = 1.0 + r2 * (k1 + r2 * k2)
-        return (
-            c * a + p1 * ab + p2 * (r2 + 2.0 * (a * a)),
-            c * b + p1 * (r2 + 2.0 * (b * b)) + p2 * ab,
-        )
-
-    @staticmethod
-    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
-        nearness = 1.0 / point[2]
-        a, b, k1, k2, p1, p2 = point[0] * nearness, point[1] * nearness, *k
-        r2, ab = a * a + b * b, 2.0 * (a * b)
-        c = 1.0 + r2 * (k1 + r2 * k2)
-        along_a, along_b = r2 + 2.0 * (a * a), r2 + 2.0 * (b * b)
-        radial = dot((a, b), g)
-        k_g = (
-            times(r2, radial),
-            times(r2 * r2, radial),
-            dot((ab, along_b), g),
-            dot((along_a, ab), g),
-        )
-        slope = times(2.0 * (k1 + 2.0 * (r2 * k2)), radial)
-        mixed = 2.0 * (p1 * a + p2 * b)
-        a_g = dot((c + 2.0 * (p1 * b) + 6.0 * (p2 * a), mixed), g) + a * slope
-        b_g = dot((mixed, c + 6.0 * (p1 * b) + 2.0 * (p2 * a)), g) + b * slope
-        return scale(nearness, (a_g, b_g, -(a * a_g + b * b_g))), k_g
+    camera = CAMERA_MODELS["radtan"]
 
 
 class ReprojectionEquidistant(_Reprojection):
@@ -141,52 +72,4 @@ class ReprojectionEquidistant(_Reprojection):
         landmark, T_body_camera: as in `ReprojectionRadtan`. intrinsics: [fx, fy, cx, cy, k1, k2, k3, k4].
     """
 
-    @staticmethod
-    def _visible(point: Vector) -> tuple[Vector, Scalar]:
-        z = point[2]
-        squared = dot(point, point)
-        behind = (squared < 1e-24) | ((z < 0.0) & (_BEHIND * squared < z * z))
-        return (*point[:2], where(behind, 1.0, z)), where(behind, z - z, 1.0)
-
-    @staticmethod
-    def _angle(point: Vector) -> tuple[Scalar, Scalar, Scalar]:
-        """theta / r, theta^2, and the squared distance.
-
-        Through tan(theta/4), which is smooth in r^2 on the axis, too, and at most one.
-        """
-        x, y, z = point
-        r2 = x * x + y * y
-        distance2 = r2 + z * z
-        reach = 1.0 / (z + sqrt(distance2))
-        half2 = r2 * (reach * reach)
-        quarter = 1.0 / (1.0 + sqrt(1.0 + half2))
-        ratio = 4.0 * reach * quarter * arctan_factor(half2 * (quarter * quarter))
-        return ratio, r2 * (ratio * ratio), distance2
-
-    @staticmethod
-    def _distort(point: Vector, k: Vector) -> Vector:
-        ratio, angle2, _ = ReprojectionEquidistant._angle(point)
-        k1, k2, k3, k4 = k
-        stretch = 1.0 + angle2 * (k1 + angle2 * (k2 + angle2 * (k3 + angle2 * k4)))
-        return scale(ratio * stretch, point[:2])
-
-    @staticmethod
-    def _distort_reverse(point: Vector, k: Vector, g: Vector) -> tuple[Vector, Vector]:
-        x, y, z = point
-        ratio, angle2, distance2 = ReprojectionEquidistant._angle(point)
-        k1, k2, k3, k4 = k
-        d = ratio * (1.0 + angle2 * (k1 + angle2 * (k2 + angle2 * (k3 + angle2 * k4))))
-        slope = 1.0 + angle2 * (
-            3.0 * k1 + angle2 * (5.0 * k2 + angle2 * (7.0 * k3 + angle2 * (9.0 * k4)))
-        )  # of d r with theta
-        outward = dot((x, y), g)
-        k_g, power = [], ratio * angle2
-        for _ in k:
-            k_g.append(times(power, outward))
-            power = power * angle2
-        # theta moves with r as z / distance^2 and with z as -r / distance^2. On the axis the direction of r is
-        # arbitrary, and its factor zero.
-        turn = slope / distance2
-        along = times((turn * z - d) / (x * x + y * y + 1e-300), outward)
-        point_g = (*add(scale(d, g), scale(along, (x, y))), -times(turn, outward))
-        return point_g, tuple(k_g)
+    camera = CAMERA_MODELS["equidistant"]

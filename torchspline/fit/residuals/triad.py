@@ -1,10 +1,8 @@
 """What three axes on the body make of a vector: `S R^T x + b`, the error model that inertial sensors share."""
 
-from collections.abc import Mapping
-
 from torchspline.arithmetic.motion import turned, turned_reverse
 from torchspline.arithmetic.vector import Vector, add, dot, scale, zero
-from torchspline.fit.residual import ROTATION_IN_BODY, Slot
+from torchspline.fit.residual import ROTATION_IN_BODY, Cotangents, Given, Slot
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -17,12 +15,12 @@ TRIAD = {
 }
 
 
-def reading(given: Mapping[str, Vector], x: Vector) -> Vector:
+def reading(given: Given, x: Vector) -> Vector:
     """What the axes read of a vector x in the body frame."""
     return add(scaled(given["scaling"], turned(given["rotation"], x)), given["bias"])
 
 
-def reading_reverse(given: Mapping[str, Vector], x: Vector, g: Vector) -> tuple[Vector, dict[str, Vector]]:
+def reading_reverse(given: Given, x: Vector, g: Vector) -> tuple[Vector, Cotangents]:
     """Cotangents of the vector and of the slots of `TRIAD`, from that of the reading."""
     seen = turned(given["rotation"], x)
     scaling_g, seen_g = scaled_reverse(given["scaling"], seen, g)
