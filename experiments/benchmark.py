@@ -3,7 +3,8 @@
 Peers are optional, `pip install -c constraints.txt -e '.[bench]'`; what is missing is named and left out. Every
 contender that computes the same thing is compared with the reference before anything is timed.
 
-`benchmark.md` among the results has the tables and the machine; a copy of a quiet run lies beside this file.
+`benchmark.md` among the results has the tables and the machine. On a quiet machine `--publish true` also keeps the
+figures in `benchmark.json` beside this file, of which `benchmark.md` and the page of the documentation are made.
 """
 
 import importlib.metadata
@@ -11,27 +12,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bench import contenders
+from bench import contenders, document
 from bench.problems import PEERS
 from bench.sections import SECTIONS, Plan
 from bench.sweeps import Sizes
-from common import Table, machine, run, save, show, versions
-
-
-def agreement(rows: list[dict[str, Any]]) -> Table:
-    lines = [
-        [
-            row["contender"],
-            row["group"],
-            row["what"],
-            ", ".join(f"{name} {x:.1e}" for name, x in row["deviation"].items()),
-        ]
-        for row in rows
-    ]
-    title = (
-        "Largest deviation from the reference, relative to the largest number (gradients across quaternions)"
-    )
-    return Table(title, ("", "group", "", "deviation"), lines)
+from common import machine, run, save, show, versions
 
 
 def experiment(
@@ -48,6 +33,7 @@ def experiment(
     patience: float,
     shrink: int,
     verify: list[str],
+    publish: bool,
 ) -> dict[str, Any]:
     """Times this library against its goals and against others.
 
@@ -62,10 +48,14 @@ def experiment(
         patience: seconds for one contender at one size, over all rounds.
         shrink: how many times less to do for goals and group operations.
         verify: groups on which results and gradients of all contenders are compared first.
+        publish: whether the figures join `benchmark.json` beside this file, and the page of the documentation is
+            written anew from it. A run of some sections replaces those, and the page says so.
     """
     unknown = set(sections) - set(SECTIONS)
     if unknown:
         raise SystemExit(f"sections: {', '.join(sorted(unknown))} not among {', '.join(SECTIONS)}")
+    if publish and shrink > 1:
+        raise SystemExit(f"publish: expected the whole work, got shrink {shrink}; leave one of them out")
     plan = Plan(Sizes(queries, points, orders, batches, base), goals, operations, rounds, patience, shrink)
     seconds, started = {}, time.perf_counter()
     deviations = contenders.verify(verify, plan.notes)
@@ -75,41 +65,25 @@ def experiment(
         seconds[name] += time.perf_counter()
         print(f"{name}: {seconds[name]:.0f} s", flush=True)
     seconds["verify"] = time.perf_counter() - started - sum(seconds.values())
-    tables = [agreement(deviations)] if deviations else []
-    tables += [table for report in reports.values() for table in report.tables]
-    if plan.notes:
-        tables.append(
-            Table("Who did not take part everywhere", ("",), [[note] for note in sorted(plan.notes)])
-        )
     peers = {name: version(module) for module, name in PEERS.items()}
-    write_document(out, show(out, tables), peers)
-    for name, report in reports.items():
-        if report.figure is not None:
-            save(report.figure, out / f"{name}.png")
-    return {
+    figures = {
         "deviations": deviations,
         **{name: report.record for name, report in reports.items()},
         "section_seconds": seconds,
         "notes": sorted(plan.notes),
         "peers": peers,
     }
-
-
-def write_document(out: Path, tables: Path, peers: dict[str, str | None]) -> Path:
-    """`benchmark.md`: what ran where, and all tables."""
-    here = machine()
-    known = {**versions(), **peers}
-    software = ", ".join(f"{name} {number}" for name, number in known.items() if number is not None)
-    heading = (
-        "# Benchmark\n\n"
-        "Written by `python experiments/benchmark.py`. All contenders took turns in one process; a contender that "
-        "computes the same thing was compared with the reference first.\n\n"
-        f"Machine: {here['processor']}, {here['usable_cores']} cores, {here['system']} ({here['architecture']}); one "
-        f"thread unless said.\nSoftware: {software}.\n\n"
-    )
-    path = out / "benchmark.md"
-    path.write_text(heading + tables.read_text(encoding="utf-8"), encoding="utf-8")
-    return path
+    measured: document.Run = {
+        "figures": figures, "versions": versions(), "machine": machine(), "config": {"shrink": shrink},
+    }  # fmt: skip
+    show(out, [table for tables in document.tables_of(measured).values() for table in tables])
+    (out / "benchmark.md").write_text(document.document([measured]), encoding="utf-8")
+    if publish:
+        document.publish(measured)
+    for name, report in reports.items():
+        if report.figure is not None:
+            save(report.figure, out / f"{name}.png")
+    return figures
 
 
 def version(module: str) -> str | None:
@@ -133,5 +107,6 @@ if __name__ == "__main__":
             "patience": 0.1,
             "shrink": 100,
             "verify": ["SO3"],
+            "publish": False,
         },
     )

@@ -1,4 +1,4 @@
-"""The figures of the documentation, and what its pages print."""
+"""The figures of the documentation, what its pages print, and the stories as notebooks (extra `docs`)."""
 
 import contextlib
 import os
@@ -23,12 +23,12 @@ def _inside(folder: Path) -> Iterator[None]:
 
 
 def experiment(out: Path, pages: list[str], publish: bool, seed: int) -> dict[str, Any]:
-    """Draws the pictures of the conventions, runs pages of the documentation, and puts their figures in their place.
+    """Draws the pictures of the conventions, runs pages and stories as notebooks, and puts the results in their place.
 
     Args:
         out: folder for the results.
         pages: names of pages below `torchspline/docs`, or `all` for those with code.
-        publish: whether figures replace those in `torchspline/docs/figures`.
+        publish: whether figures and notebooks replace those in `torchspline/docs`.
         seed: recorded; pages set their own.
     """
     names = pages
@@ -39,7 +39,7 @@ def experiment(out: Path, pages: list[str], publish: bool, seed: int) -> dict[st
     rows: list[list[Any]] = []
     for name in names:
         (out / "figures").mkdir(exist_ok=True)
-        with _inside(out):
+        with _inside(out / "figures"):
             for block, printed, _ in run_page(DOCS / name):
                 shown = block.output is not None
                 same = same_output(printed, block.output or "") if shown else "-"
@@ -47,12 +47,30 @@ def experiment(out: Path, pages: list[str], publish: bool, seed: int) -> dict[st
                 if same is False:
                     print(f"{name}, line {block.line} prints:\n{printed}")
     drawn += sorted((out / "figures").glob("*.png")) if (out / "figures").is_dir() else []
+    stories = [DOCS / name for name in names if name.startswith("stories/")]
+    written = []
+    if stories:
+        try:
+            from pages import notebooks
+        except ModuleNotFoundError as error:
+            raise SystemExit(
+                f"pages: stories need {error.name}: pip install -c constraints.txt -e '.[docs]'"
+            ) from None
+        written = [notebooks.write(page, out) for page in stories]
     if publish:
         for path in drawn:
             shutil.copy(path, DOCS / "figures" / path.name)
-    rows += [[path.name, "-", "-"] for path in drawn]
-    show(out, [Table("Pages and figures", ["page or figure", "line", "prints what it shows"], rows)])
-    return {"figures": [path.name for path in drawn], "blocks": len(rows) - len(drawn), "seed": seed}
+        for path in written:
+            shutil.copy(path, DOCS / "stories" / path.name)
+    rows += [[path.name, "-", "-"] for path in [*drawn, *written]]
+    show(
+        out, [Table("Pages and figures", ["page, figure or notebook", "line", "prints what it shows"], rows)]
+    )
+    return {
+        "figures": [path.name for path in drawn],
+        "blocks": len(rows) - len(drawn) - len(written),
+        "seed": seed,
+    }
 
 
 if __name__ == "__main__":

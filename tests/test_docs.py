@@ -33,8 +33,6 @@ def test_code_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["page"])
     matplotlib.use("agg")
-    figures = tmp_path / "figures"
-    figures.mkdir()
     seed = torch.get_rng_state()
     try:
         for block, printed, _ in run_page(DOCS / name):
@@ -45,7 +43,7 @@ def test_code_runs_and_prints_what_is_shown(name, tmp_path, monkeypatch):
     finally:
         torch.set_rng_state(seed)
     shown = {path.name for path in images(DOCS / name)}
-    drawn = {path.name for path in figures.iterdir()}
+    drawn = {path.name for path in tmp_path.glob("*.png")}
     assert drawn <= shown, f"{name} draws {drawn - shown}, which it does not show"
 
 

@@ -21,6 +21,9 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "experiments"))
 from pages import DOCS
 
 pytest.importorskip("mkdocs", reason="no MkDocs: pip install -c constraints.txt -e '.[docs]'")
+sections = pytest.importorskip(
+    "pages.sections", reason="no Griffe: pip install -c constraints.txt -e '.[docs]'"
+)
 typeset = pytest.importorskip(
     "pages.typeset", reason="no latex2mathml: pip install -c constraints.txt -e '.[docs]'"
 )
@@ -61,6 +64,32 @@ def test_names_are_words_and_primes_no_superscripts():
 def test_what_cannot_be_translated_is_named(latex):
     with pytest.raises(ValueError, match=r"does not know (\\nosuchcommand|&) in the formula"):
         typeset.mathml(latex, block=False)
+
+
+# ---------------------------------------------------------------------- docstrings
+
+
+def test_docstrings_are_divided_into_parameters_and_errors():
+    found = sections.divided(
+        "Does it.\nArgs:\n    a, b: numbers,\n        m.\n    c: of it. d: of that, s.\n"
+        "Raises:\n    TypeError, ValueError: a wrong\n    type. KeyError: none.\n"
+    )
+    assert found == (
+        "Does it.\n\nArgs:\n    a: numbers,\n        m.\n    b: see `a`.\n    c: of it.\n    d: of that, s.\n"
+        "\nRaises:\n    TypeError, ValueError: a wrong\n        type.\n    KeyError: none.\n"
+    )
+
+
+def test_fields_are_described_by_the_comments_above_them():
+    lines = ["class X:", "    #: m,", "    #: in the world.", "    a: int", "    b: int", "", "    c: int"]
+    found = sections.fields(lines, {"a": 4, "b": 5, "c": 7})
+    assert found == {"a": "m,\n        in the world.", "b": "see `a`."}
+
+
+def test_fields_of_results_are_in_the_reference(site):
+    page = (site / "reference" / "fit" / "index.html").read_text(encoding="utf-8")
+    assert "(3,) position of the IMU in the body, m." in page
+    assert "that hardly turns; readings that have nothing in common with the trajectory." in page
 
 
 @pytest.fixture(scope="module")

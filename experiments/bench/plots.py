@@ -1,41 +1,16 @@
-"""Figures and tables of the sections."""
+"""Figures of the sections."""
 
 from collections.abc import Sequence
 from typing import Any
 
-from common import Table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from bench.contenders import CONTENDERS, LIMIT
+from bench.tables import SWEEPS
 
 COLOURS = {contender.name: f"C{i}" for i, contender in enumerate(CONTENDERS)}
-SWEEPS = ("forward", "forward + backward")
-
-
-def number(x: float) -> str:
-    return f"{x:.3g}" if x < 100 or x >= 1e6 else f"{x:.0f}"
-
-
-def sweep_tables(title: str, rows: Sequence[dict[str, Any]]) -> list[Table]:
-    tables = []
-    for sweep in SWEEPS:
-        here = [row for row in rows if row["sweep"] == sweep]
-        places = list(dict.fromkeys(row["x"] for row in here))
-        cells = {(row["contender"], row["x"]): row for row in here}
-        names = [c.name for c in CONTENDERS if any(row["contender"] == c.name for row in here)]
-        lines = []
-        for name in names:
-            found = (cells.get((name, x)) for x in places)
-            lines.append([name, *("-" if row is None else pair(row) for row in found)])
-        header = ["", *(x if isinstance(x, str) else f"{x:,}" for x in places)]
-        tables.append(Table(f"{title}; {sweep}: ns per query, min (median)", header, lines))
-    return tables
-
-
-def pair(row: dict[str, Any]) -> str:
-    return f"{number(row['ns_per_query_min'])} ({number(row['ns_per_query_median'])})"
 
 
 def draw_sweep(title: str, axis: str, rows: Sequence[dict[str, Any]]) -> Figure:
@@ -88,22 +63,6 @@ def _lines(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
             axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def goals_table(rows: Sequence[dict[str, Any]], shrink: int) -> Table:
-    lines = []
-    for row in rows:
-        sign = "≥" if row["at_least"] else "≤"
-        goal = "-" if row["bound"] is None else f"{sign} {row['bound']:g}"
-        found = (number(row["min"]), number(row["median"]))
-        lines.append([row["goal"], row["unit"], *found, goal, row["met"] or "-"])
-    less = f"; HERE {shrink} TIMES LESS" if shrink > 1 else ""
-    return Table(
-        "Goals (one thread, float64, order 4, sorted times, 1000 control points, value and two derivatives, 1e5 "
-        f"queries; group operations 1e6, 2 threads, with backward{less})",
-        ("", "unit", "min", "median", "goal", "met"),
-        lines,
-    )
-
-
 def draw_goals(rows: Sequence[dict[str, Any]]) -> Figure:
     """What was measured as a share of its goal, the goal being at 1 and better being left of it."""
     chosen = [row for row in rows if row["bound"] is not None]
@@ -124,17 +83,6 @@ def draw_goals(rows: Sequence[dict[str, Any]]) -> Figure:
     axes.set(xlabel="measured / goal (point: median; line: to the least; left of 1 is met)", title="Goals")
     axes.grid(True, axis="x", which="both", alpha=0.3)
     return figure
-
-
-def operations_table(rows: Sequence[dict[str, Any]]) -> Table:
-    lines = [
-        [row["operation"], row["threads"], row["contender"], pair(row), f"{row['busy']:.2f}"] for row in rows
-    ]
-    return Table(
-        "Group operations, forward + backward: ns each, min (median)",
-        ("operation", "threads", "", "ns", "processor time / time"),
-        lines,
-    )
 
 
 def draw_operations(rows: Sequence[dict[str, Any]]) -> Figure:

@@ -45,7 +45,7 @@ def images(page: Path) -> list[Path]:
 def run_page(page: Path) -> Iterator[tuple[Block, str, dict]]:
     """Runs a page block by block; each with what it printed and the namespace so far.
 
-    Figures go to `figures/` in the current folder. Tracebacks name the page and the line in it. One thread: the tensors
+    Figures go to the current folder. Tracebacks name the page and the line in it. One thread: the tensors
     are small, and threads of several processes would wait for each other.
     """
     torch.manual_seed(0)

@@ -27,14 +27,17 @@ def _space(
     return axes
 
 
-def _frame(axes: Any, pose: Tensor, length: float, name: str = "", alpha: float = 1.0) -> None:
-    """Axes x, y, z of a pose in red, green and blue."""
+def _frame(
+    axes: Any, pose: Tensor, length: float, name: str = "", alpha: float = 1.0,
+    shift: tuple[float, float, float] = (-0.3, -0.3, -0.3),
+) -> None:  # fmt: skip
+    """Axes x, y, z of a pose in red, green and blue; its name is shifted by a multiple of their length."""
     origin = pose[:3]
     for i, color in enumerate(_COLORS):
         tip = ts.SE3.act(pose, length * torch.eye(3, dtype=F64)[i])
         axes.plot(*torch.stack([origin, tip]).T.tolist(), color=color, alpha=alpha, linewidth=2)
     if name:
-        axes.text(*(origin - 0.3 * length).tolist(), name, fontsize=11)
+        axes.text(*(origin + length * torch.tensor(shift, dtype=F64)).tolist(), name, fontsize=11)
 
 
 def _pose(*numbers: float) -> Tensor:
@@ -67,7 +70,7 @@ def frames() -> Figure:
         pose, motion = spline(now), spline.kinematics(now)
         assert motion.velocity is not None
         assert motion.angular_velocity is not None
-        _frame(axes, pose, 0.55, "body")
+        _frame(axes, pose, 0.55, "body", shift=(-0.75, 0.0, 0.4))
         mounted = spline.mounted(_pose(-0.5, -0.3, -0.8, 0.9, 0.3, 0.3, 0.0))(now)
         _frame(axes, mounted, 0.35, "sensor")
         axes.plot(*torch.stack([pose[:3], mounted[:3]]).T.tolist(), "k:", label="lever arm, in the body")

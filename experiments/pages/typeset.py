@@ -16,7 +16,7 @@ _log = logging.getLogger("mkdocs.hooks.typeset")
 
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.S)
 _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.S)
-_FUNCTIONS = ("sin", "cos", "cot", "exp")
+_FUNCTIONS = ("sin", "cos", "cot", "exp", "ln")
 _PRIMES = ("′", "″", "‴")
 
 
@@ -77,7 +77,7 @@ def _lower_prime(node: Element) -> None:
 
 
 def _set_spaces(row: Element) -> None:
-    """Spaces as in TeX: signs close to what they belong to, none around a slash, one behind the name of a function."""
+    """Spaces as in TeX: signs close to what they belong to, none around a slash, one beside the name of a function."""
     last = None
     for i, node in reversed(list(enumerate(row))):
         before = row[i - 1] if i else None
@@ -89,8 +89,11 @@ def _set_spaces(row: Element) -> None:
         ):
             node.set("form", "prefix")
             node.set("rspace", "0")
-        elif node.tag == "mi" and node.text in _FUNCTIONS and last is not None and last.tag != "mo":
-            row.insert(i + 1, Element("mspace", width="0.167em"))
+        elif node.tag == "mi" and node.text in _FUNCTIONS:
+            if last is not None and last.tag != "mo":
+                row.insert(i + 1, Element("mspace", width="0.167em"))
+            if before is not None and before.tag in ("mi", "mn"):
+                row.insert(i, Element("mspace", width="0.167em"))
         last = node
 
 
