@@ -304,7 +304,7 @@ def test_noise_stated_a_thousand_times_too_large(calibration, simulated, start):
 
 def test_noise_stated_far_too_small_is_named(simulated, start):
     quiet = with_noise(simulated.recording, 1e-3)
-    with pytest.raises(ValueError, match="noise densities and pixel_sigma = 0.5 .* right size") as caught:
+    with pytest.raises(ValueError, match=r"noise densities and pixel_sigma = 0.5 .* right size") as caught:
         calibrate(quiet, start, spacing=0.05, stretch=None)
     message = str(caught.value)
     assert "not determine all" in message
