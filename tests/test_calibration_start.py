@@ -76,9 +76,7 @@ def test_known_time_offsets_stay_where_they_are_not_estimated(simulated, recordi
     assert found.cameras[0].time_offset_sigma is None
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit"), [(1e3, "mm"), (1e-3, "km"), (7.0, None)]
-)
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "mm"), (1e-3, "km"), (7.0, None)])
 def test_boards_in_other_units_are_named(recording, factor, unit):
     """The motion they tell is not that of the accelerometer: its scale says by how much, before anything is solved."""
     wrong = replace(recording.corners[0], xyz=recording.corners[0].xyz * factor, source="cam0.npz")
