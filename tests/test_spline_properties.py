@@ -1,15 +1,15 @@
 """What holds for every family of splines on any group, order, clock, batch and control points, looked for with
-Hypothesis: the same few examples in every run, or thousands of random ones with TORCHSPLINE_EXAMPLES=5000."""
+Hypothesis."""
 
-import os
 from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 import torch
 from batteries import generator, hat, normal, rescaled, rotation_blocks, tangents
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import examples
 from spline_cases import chain
 from torch import Tensor
 
@@ -22,8 +22,7 @@ EPS = torch.finfo(F64).eps
 GROUPS = ("SO3", "SE3", "DualQuaternion", "SO2", "SE2", "R1", "R3", "R3xSO3", "SE2xR2xSO3")
 ABELIAN = ("SO2", "R1", "R3")
 
-HUNT = int(os.environ.get("TORCHSPLINE_EXAMPLES", "0"))
-some = settings(max_examples=HUNT or 10, derandomize=not HUNT, deadline=None, database=None, print_blob=True)
+some = examples(10)
 each_family = pytest.mark.parametrize("family", ["uniform", "nonuniform", "hermite", "keyframes"])
 
 #: Rotation between neighbours; other components move about as far.

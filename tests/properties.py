@@ -1,0 +1,12 @@
+"""How many examples Hypothesis tries: the same few in every run, or TORCHSPLINE_EXAMPLES=5000 random ones."""
+
+import os
+
+from hypothesis import settings
+
+
+def examples(count: int) -> settings:
+    many = int(os.environ.get("TORCHSPLINE_EXAMPLES", "0"))
+    return settings(
+        max_examples=many or count, derandomize=not many, deadline=None, database=None, print_blob=True
+    )
