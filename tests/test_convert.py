@@ -401,7 +401,9 @@ def test_transform3d_must_be_rigid():
     from pytorch_kinematics import Transform3d
 
     with pytest.raises(ValueError, match="orthonormal"):
-        convert.from_transform3d(Transform3d(dtype=F64).scale(2.0))
+        convert.from_transform3d(
+            Transform3d(matrix=torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=F64)))
+        )
     with pytest.raises(TypeError, match=r"transform: expected a pytorch_kinematics\.Transform3d, got Tensor"):
         convert.from_transform3d(torch.eye(4))
     with pytest.raises(ValueError, match=r"pose: expected shape \(7,\) or \(N, 7\).*got \(2, 3, 7\)"):
