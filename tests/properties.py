@@ -8,5 +8,10 @@ from hypothesis import HealthCheck, settings
 def examples(count: int) -> settings:
     many = int(os.environ.get("TORCHSPLINE_EXAMPLES", "0"))
     return settings(
-        max_examples=many or count, derandomize=not many, deadline=None, database=None, print_blob=True
+        max_examples=many or count,
+        derandomize=not many,
+        database=None,
+        print_blob=True,
+        deadline=None,
+        suppress_health_check=[HealthCheck.too_slow],  # a busy machine is no fault
     )
