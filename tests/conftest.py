@@ -11,14 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 from contract import Recorder
-from hypothesis import settings
 
 os.environ.setdefault("TORCHSPLINE_KERNELS", "reference")
-
-# The same examples in every run and on every machine, however slow; `--hypothesis-profile=explore` searches on.
-settings.register_profile("steady", derandomize=True, deadline=None)
-settings.register_profile("explore", deadline=None, print_blob=True)
-settings.load_profile("steady")
 
 RECORDER = pytest.StashKey[Recorder]()
 

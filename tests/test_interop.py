@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import examples
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -138,7 +139,7 @@ def test_trajectories_come_back_bit_for_bit(tmp_path, name):
     st.floats(1e-300, 1e300),
     st.floats(-1e300, 1e300),
 )
-@settings(max_examples=30)
+@examples(30)
 def test_any_float64_survives_in_a_trajectory(numbers, dt, t0):
     made = ts.BSpline(torch.tensor(numbers, dtype=F64).reshape(4, 2), group=ts.Rn(2), dt=dt, t0=t0)
     with tempfile.TemporaryDirectory() as folder:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from io_cases import EUROC_ROW, IMU_ROW, KITTI_ROW, STAMP, TUM_ROW, imu, poses, put
+from properties import examples
 from scipy.spatial.transform import Rotation
 
 from torchspline.io import ImuRecord, PoseRecord, read_imu, read_poses, write_imu, write_poses
@@ -21,7 +22,7 @@ floats = st.floats(allow_infinity=False)
 
 
 @given(stamps, st.lists(floats, min_size=7, max_size=7), st.sampled_from(["", ".gz"]))
-@settings(max_examples=30)
+@examples(30)
 def test_what_is_written_is_read_back_to_the_last_digit(time_ns, row, suffix):
     values = torch.tensor([row] * len(time_ns), dtype=torch.float64)
     values[:, 3] = 1.0  # no zero quaternion

@@ -5,9 +5,10 @@ from decimal import Decimal
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from io_cases import STAMP, imu, poses
+from properties import examples
 
 from torchspline.io import PoseRecord
 from torchspline.io.text import format_seconds, parse_seconds
@@ -111,7 +112,7 @@ def test_times_that_are_no_time(text):
 
 
 @given(st.integers(-(2**63), 2**63 - 1))
-@settings(max_examples=200)
+@examples(200)
 def test_seconds_as_text_round_trip(time_ns):
     assert Decimal(format_seconds(time_ns)) == Decimal(time_ns).scaleb(-9)
     assert parse_seconds(format_seconds(time_ns)) == time_ns
