@@ -28,7 +28,8 @@ F64 = torch.float64
 
 def pytest_generate_tests(metafunc):
     """Every test by compiled loops, and by the reference where that takes less than a few seconds."""
-    long = any(word in metafunc.function.__name__ for word in ("rigid", "scatter"))
+    words = ("rigid", "scatter", "window_with", "update_with")
+    long = any(word in metafunc.function.__name__ for word in words)
     metafunc.parametrize("kernels", ["auto"] if long else ["auto", "reference"], indirect=True)
 
 
@@ -523,7 +524,7 @@ def test_a_linear_window_with_a_spline_of_biases_equals_the_batch_solution(nanos
                 model = linearizer.model
                 linearizer.terms.append(Bends(model, np.full(3, 0.5)))  # 1 / (dt smoothness)
                 linearizer.terms.append(Walk(model, bias, np.full(3, 1.0 / (0.3 * math.sqrt(knots)))))
-                state, *_ = minimise(model, model.state(), linearizer, LINEAR, lambda _: None)
+                state, system, _ = minimise(model, model.state(), linearizer, LINEAR, lambda _: None)
             free = result._linearizer.model.splines[0].count
             apart = SO3.log(SO3.between(torch.from_numpy(state.points[id(whole)]), before))[-free:]
             assert_allclose(apart[:, 2], torch.zeros(free, dtype=F64), atol=1e-9)
@@ -531,6 +532,9 @@ def test_a_linear_window_with_a_spline_of_biases_equals_the_batch_solution(nanos
             found = torch.from_numpy(state.points[id(bias)])
             assert found.shape == online.shape
             assert_allclose(online[-moving:], found[-moving:], atol=1e-9)
+            columns = model.columns[id(bias)][-moving:, 2]
+            variances = system.factor(np.zeros(model.total)).inverse(columns, columns)
+            assert_allclose(result.standard_deviation(bias)[:, 2], np.sqrt(variances), rtol=1e-6)
             steps += 1
     assert steps > 2
     assert window._first > 20

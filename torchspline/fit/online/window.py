@@ -289,7 +289,8 @@ class SlidingWindow:
         Args:
             max_iterations, cost_tolerance, gradient_tolerance, damping: as for `Problem.solve`.
         Returns:
-            Result, of the control points that were in the window: times of its `trajectory_covariance` lie there.
+            Result, of the control points that were in the window, of the trajectory as of other splines: times of its
+            `trajectory_covariance` lie there.
         Raises:
             ValueError: nothing was measured yet, a wrong option, a cost that is not finite.
         """
@@ -316,6 +317,8 @@ class SlidingWindow:
             self._grown.points[self._first : self._grown.count] = spline.control_points
             for x in wandering:
                 x.moved(parts[x.module])
+                # The result knows the spline by the caller's module.
+                model.columns[id(x.module)] = model.columns[id(parts[x.module])]
             result = Result(linearizer, state, system, trace)
             excess = self._grown.count - self._first - self.order + 1 - self._segments
             if excess > 0:
