@@ -1,12 +1,13 @@
 """A trajectory from inertial readings and sparse poses: what motion capture saw in between is withheld and recovered.
 
 Poses thinned to a few a second hold the trajectory in place; gyroscope and accelerometer, at their full rate, say how
-it moves in between. Unknown besides the control points: biases, the direction of gravity, the offset and rate of the
-IMU's clock. The result is compared with the poses that were left out.
+it moves in between. Unknown besides the control points: biases, the direction of gravity, the mounting, the offset and
+rate of the IMU's clock and the delay between its sensors. The result is compared with the poses that were left out.
 """
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,7 +56,13 @@ def fit(
     clock = Clock(
         Variable("time_offset", zero[:1]), Variable("clock_skew", zero[:1]), mid=int(low + high) // 2
     )
+    # The filters of the two sensors differ: one clock for both would be wrong by a millisecond for one of them.
+    late = torch.ones(len(t), dtype=torch.float64)
+    accel_clock = replace(clock, delay=Variable("accel_delay", zero[:1]), late=late)
     gravity = Variable("gravity", torch.tensor(STANDARD_GRAVITY, dtype=torch.float64), sphere=True)
+    # Poses are said to be the IMU's own; how well that is calibrated shows here.
+    rotation = Variable("rotation", SO3.identity(), group=SO3)
+    lever_arm = Variable("lever_arm", zero)
     biases: dict[str, Variable | BSpline] = {
         name: Variable(name, zero) if bias_spacing == 0.0 else _bias(low, high, bias_spacing)
         for name in ("gyro_bias", "accel_bias")
@@ -71,12 +78,13 @@ def fit(
             loss=Huber(3.0),
             clock=clock,
             bias=biases["gyro_bias"],
+            rotation=rotation,
         )
     )
     problem.add(
         RESIDUALS["Accelerometer"](
-            t, samples.accelerometer[inside], sigma=SIGMAS[3], loss=Huber(3.0), clock=clock,
-            bias=biases["accel_bias"], gravity=gravity,
+            t, samples.accelerometer[inside], sigma=SIGMAS[3], loss=Huber(3.0), clock=accel_clock,
+            bias=biases["accel_bias"], gravity=gravity, rotation=rotation, lever_arm=lever_arm,
         )
     )  # fmt: skip
     result = problem.solve(cost_tolerance=1e-7)
@@ -174,6 +182,7 @@ def experiment(
                     f"{position.max() * 1e3:.1f} / {math.degrees(angle.max()):.2f}",
                     f"{fitted.variables['time_offset'].item() * 1e3:+.2f}",
                     f"{fitted.variables['clock_skew'].item() * 1e6:+.1f}",
+                    f"{fitted.variables['accel_delay'].item() * 1e3:+.2f}",
                     fitted.iterations,
                     f"{fitted.seconds:.1f}",
                 )
@@ -193,7 +202,8 @@ def experiment(
                 "seconds": fitted.seconds,
             }
     header = ["trajectory", "bias", "before: position [mm] / rotation [deg]", "RMS [mm] / [deg]",
-              "largest [mm] / [deg]", "offset [ms]", "skew [1e-6]", "iterations", "time [s]"]  # fmt: skip
+              "largest [mm] / [deg]", "offset [ms]", "skew [1e-6]",
+              "accelerometer later by [ms]", "iterations", "time [s]"]  # fmt: skip
     title = f"{record.name}: {len(withheld)} withheld poses from {len(chosen)} at {rate:g} Hz and the IMU"
     show(out, [Table(title, header, rows)])
     save(_figure((stamps[withheld] - stamps[0]) / SECOND, drawn, title), out / "inertial_fit.png")

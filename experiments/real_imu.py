@@ -73,29 +73,31 @@ def errors(
 ) -> tuple[float, float]:
     """RMSE between recorded and synthesised readings, pooled over samples and axes."""
     samples = recording.samples
-    t = alignment.pose_time(samples.time_ns)
-    inside = (t >= start + MARGIN) & (t <= stop - MARGIN)
     assert alignment.gravity is not None
-    with torch.no_grad():
-        made = measure(
-            trajectory,
-            t[inside],
-            gravity=alignment.gravity,
-            gyroscope_bias=alignment.gyro_bias,
-            accelerometer_bias=alignment.accel_bias,
-            T_body_imu=alignment.T_body_imu,
-        )
-    pairs = ((samples.gyroscope, made.gyroscope), (samples.accelerometer, made.accelerometer))
-    gyro, accel = (math.sqrt((x[inside] - y).square().nanmean().item()) for x, y in pairs)
-    return gyro, accel
+    rmse = []
+    for sensor, recorded in (("gyro", samples.gyroscope), ("accel", samples.accelerometer)):
+        t = alignment.pose_time(samples.time_ns, sensor=sensor)
+        inside = (t >= start + MARGIN) & (t <= stop - MARGIN)
+        with torch.no_grad():
+            made = measure(
+                trajectory,
+                t[inside],
+                gravity=alignment.gravity,
+                gyroscope_bias=alignment.gyro_bias,
+                accelerometer_bias=alignment.accel_bias,
+                T_body_imu=alignment.T_body_imu,
+            )
+        error = recorded[inside] - (made.gyroscope if sensor == "gyro" else made.accelerometer)
+        rmse.append(math.sqrt(error.square().nanmean().item()))
+    return rmse[0], rmse[1]
 
 
-def halves(recording: Recording, dt: float) -> dict[str, Any]:
+def halves(recording: Recording) -> dict[str, Any]:
     """Time offsets of the two halves of a whole recording, each found by itself, with and without a skew.
 
     Without a skew each is the offset in the middle of its half; with one, that in the middle of the recording.
     """
-    fit = fit_poses(recording.poses.time_ns, recording.pose, dt=dt, progress=False)
+    fit = fit_poses(recording.poses.time_ns, recording.pose, dt="auto", progress=False)
     samples = recording.samples
     first, last = fit.trajectory.domain
     middle = (first + last) // 2
@@ -103,6 +105,7 @@ def halves(recording: Recording, dt: float) -> dict[str, Any]:
     on_poses = whole.pose_time(samples.time_ns)
     offsets: dict[str, list[float]] = {"constant": [], "drifting": []}
     deviations: dict[str, list[float]] = {"constant": [], "drifting": []}
+    middles = []
     for part in (on_poses < middle, on_poses >= middle):
         for kind in offsets:
             a = align_imu(
@@ -114,19 +117,40 @@ def halves(recording: Recording, dt: float) -> dict[str, Any]:
             assert isinstance(skew, float)
             assert isinstance(a.std["time_offset"], float)
             deviations[kind].append(math.hypot(a.std["time_offset"], skew * away))
+            if kind == "constant":
+                middles.append(a.t_mid / SECOND)
     apart = {kind: x[1] - x[0] for kind, x in offsets.items()}
     return {
         "offsets_s": offsets,
         "standard_deviations_s": deviations,
         "apart_s": apart,
+        "seconds_apart": middles[1] - middles[0],
         "needs_skew": abs(apart["constant"]) > AGREEMENT,
-        "agree": min(map(abs, apart.values())) <= AGREEMENT,
         "skew": whole.clock_skew,
         "skew_standard_deviation": whole.std["clock_skew"],
         "time_offset_s": whole.time_offset,
+        "accelerometer_delay_s": whole.accel_delay,
+        "accelerometer_delay_standard_deviation_s": whole.std["accel_delay"],
         "lever_arm_m": whole.lever_arm,
         "rotation_imu_body": whole.rotation_imu_body,
     }
+
+
+def judge(clocks: dict[str, dict[str, Any]]) -> None:
+    """Adds how far the halves are apart if the clocks drift as in the other recordings with the same devices.
+
+    Those know the drift better than half a recording does, whose offset has to be carried to the middle of the whole;
+    and they know it independently.
+    """
+    for name, x in clocks.items():
+        others = [
+            y for other, y in clocks.items() if other != name and other.split("/")[0] == name.split("/")[0]
+        ]
+        if others:
+            weights = [y["skew_standard_deviation"] ** -2 for y in others]
+            skew = sum(w * y["skew"] for w, y in zip(weights, others, strict=True)) / sum(weights)
+            x["apart_s"]["drifting as others"] = x["apart_s"]["constant"] - skew * x["seconds_apart"]
+        x["agree"] = min(map(abs, x["apart_s"].values())) <= AGREEMENT
 
 
 def _kept(recording: Recording, part: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
@@ -173,6 +197,8 @@ def tables(found: dict[str, dict[str, Any]], spacings: list[int]) -> list[Table]
                 f"{h['skew'] * 1e6:+.1f} ± {h['skew_standard_deviation'] * 1e6:.1f}",
                 f"{h['apart_s']['constant'] * 1e3:+.3f}",
                 f"{h['apart_s']['drifting'] * 1e3:+.3f}",
+                f"{h['apart_s']['drifting as others'] * 1e3:+.3f}" if len(h["apart_s"]) > 2 else "-",
+                f"{h['accelerometer_delay_s'] * 1e3:+.2f} ± {h['accelerometer_delay_standard_deviation_s'] * 1e3:.2f}",
                 "yes" if h["needs_skew"] else "no",
                 "yes" if h["agree"] else "NO",
             )
@@ -180,6 +206,7 @@ def tables(found: dict[str, dict[str, Any]], spacings: list[int]) -> list[Table]
     header = ["recording", *(f"{s} ms (yardstick)" for s in spacings), "auto", "knots [ms]", "yardstick's best",
               "reached", "time [s]"]  # fmt: skip
     clock_header = ["recording", "offset [ms]", "skew [1e-6]", "halves apart [ms]", "apart with skew [ms]",
+                    "with that of the others [ms]", "accelerometer later by [ms]",
                     "needs skew", "agree to 0.3 ms"]  # fmt: skip
     return [
         Table("Gyroscope [rad/s] / accelerometer [m/s²], RMSE", header, accuracy),
@@ -215,9 +242,10 @@ def figure(found: dict[str, dict[str, Any]], spacings: list[int]) -> Figure:
     axes[0].legend()
     axes[0].set_yticks(list(rows), [n.replace("_undisturbed", "").replace("_", " ") for n in names])
     axes[0].invert_yaxis()
-    for kind, marker in (("constant", "o"), ("drifting", "*")):
-        apart = [1e3 * found[n]["halves"]["apart_s"][kind] for n in names]
-        axes[2].plot(apart, rows, marker, label={"constant": "offset", "drifting": "offset and skew"}[kind])
+    labels = {"constant": "offset", "drifting": "offset and skew", "drifting as others": "skew of the others"}
+    for (kind, label), marker in zip(labels.items(), "o*x", strict=True):
+        apart = [1e3 * found[n]["halves"]["apart_s"].get(kind, math.nan) for n in names]
+        axes[2].plot(apart, rows, marker, label=label)
     axes[2].axvspan(-1e3 * AGREEMENT, 1e3 * AGREEMENT, color="0.9")
     axes[2].set(xlabel="second half minus first [ms]", title="time offset")
     axes[2].grid(alpha=0.3)
@@ -242,10 +270,11 @@ def experiment(out: Path, data: str, recordings: list[str], spacings: list[int],
         x: dict[Any, Any] = {"auto": compare(recording, "auto")}
         alignment = best_alignment(recording, spacings) or x["auto"].alignment
         x.update((spacing, compare(recording, spacing, alignment)) for spacing in spacings)
-        x["halves"] = halves(recording, x["auto"].spacing)
+        x["halves"] = halves(recording)
         found[name] = x
         a = x["auto"]
         print(f"{name}: {a.gyro:.4f} rad/s, {a.accel:.3f} m/s² in {a.seconds:.1f} s", flush=True)
+    judge({name: x["halves"] for name, x in found.items()})
     show(out, tables(found, spacings))
     save(figure(found, spacings), out / "real_imu.png")
     return {

@@ -32,6 +32,14 @@ def same_draws() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(scope="module")
+def compiled() -> Iterator[None]:
+    """Compiled loops wherever they pay, as for users: whole fits take several times as long without."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHSPLINE_KERNELS", "auto")
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings; the test is skipped where there is none."""

@@ -42,13 +42,15 @@ def motion(seed, duration=20.0, turn=0.25, axis=None, knot=0.3, **times):
 class Truth:
     """Readings of an IMU on a trajectory, and what an alignment should find."""
 
-    def __init__(self, trajectory, seed, offset=0.4, skew=1e-4, rate=200.0, noise=NOISE, span=(0.0, 1.0)):
+    def __init__(
+        self, trajectory, seed, offset=0.4, skew=1e-4, rate=200.0, noise=NOISE, span=(0.0, 1.0), delay=4e-4
+    ):
         g = torch.Generator().manual_seed(seed)
         start, stop = trajectory.domain
         unit = 1 / SECOND if isinstance(start, int) else 1.0
         length = (stop - start) * unit
         tau = torch.arange(span[0] * length + 1e-3, span[1] * length - 1e-3, 1 / rate, dtype=F64)
-        self.offset, self.skew, self.mid = offset, skew, 0.5 * length
+        self.offset, self.skew, self.mid, self.delay = offset, skew, 0.5 * length, delay
         #: On the IMU's clock, seconds from the start of the trajectory on its own.
         self.s = tau + offset + skew * (tau - self.mid)
         self.start, self.unit = start, unit
@@ -58,14 +60,20 @@ class Truth:
         self.gyro_bias = 0.02 * torch.randn(3, generator=g, dtype=F64)
         self.accel_bias = 0.2 * torch.randn(3, generator=g, dtype=F64)
         self.gravity = SO3.act(SO3.random(generator=g), torch.tensor(imu.STANDARD_GRAVITY, dtype=F64))
-        t = start + (tau * SECOND).round().long() if isinstance(start, int) else start + tau
+        mounted = (self.gravity, self.gyro_bias, self.accel_bias, torch.cat([ARM, q]))
         with torch.no_grad():
-            reading = imu.measure(
-                trajectory, t, self.gravity, self.gyro_bias, self.accel_bias, torch.cat([ARM, q])
+            # What bears the same stamp was measured by the accelerometer that much earlier.
+            gyro, accel = (
+                imu.measure(
+                    trajectory,
+                    start + (x * SECOND).round().long() if isinstance(start, int) else start + x,
+                    *mounted,
+                )
+                for x in (tau, tau - delay / (1 + skew))
             )
-        shape = reading.gyroscope.shape
-        self.gyro = reading.gyroscope + noise[0] * torch.randn(shape, generator=g, dtype=F64)
-        self.accel = reading.accelerometer + noise[1] * torch.randn(shape, generator=g, dtype=F64)
+        shape = gyro.gyroscope.shape
+        self.gyro = gyro.gyroscope + noise[0] * torch.randn(shape, generator=g, dtype=F64)
+        self.accel = accel.accelerometer + noise[1] * torch.randn(shape, generator=g, dtype=F64)
         #: Stamps in the unit of the trajectory.
         self.t = start + (self.s * SECOND).round().long() if isinstance(start, int) else start + self.s
 
@@ -82,6 +90,8 @@ class Truth:
             "gyro_bias": a.gyro_bias - self.gyro_bias,
         }
         if a.gravity is not None:
+            if "accel_delay" in a.std:
+                errors["accel_delay"] = torch.tensor([a.accel_delay - self.delay], dtype=F64)
             for name in ("lever_arm", "accel_bias", "gravity"):
                 errors[name] = getattr(a, name) - getattr(self, name)
         assert errors.keys() == a.std.keys()
@@ -106,6 +116,38 @@ def test_the_truth_is_found_from_scratch(seed):
     assert a.notes == []
 
 
+def test_an_accelerometer_that_is_later_than_the_gyroscope():
+    """One clock for both would be a compromise, far outside of its own standard deviation."""
+    truth = Truth(motion(4), 4, delay=-1.5e-3)
+    a = align_imu(motion(4), truth.t, truth.gyro, truth.accel)
+    assert_within(truth, a)
+    assert a.std["accel_delay"] < 1e-4
+    gyro, accel = a.pose_time(truth.t), a.pose_time(truth.t, sensor="accel")
+    torch.testing.assert_close(gyro - accel, torch.full_like(gyro, a.accel_delay), rtol=1e-3, atol=0.0)
+    one = align_imu(motion(4), truth.t, truth.gyro, truth.accel, estimate_delay=False)
+    assert one.accel_delay == 0.0
+    assert "accel_delay" not in one.std
+    assert abs(one.time_offset - truth.offset) > 10 * one.std["time_offset"]
+    with pytest.raises(ValueError, match="sensor: expected one of 'gyro', 'accel', got 'accelerometer'"):
+        a.pose_time(truth.t, sensor="accelerometer")
+
+
+def test_a_delay_that_the_motion_does_not_tell_stays_small():
+    """An accelerometer that sees gravity only while the body turns about it."""
+    trajectory = motion(5, axis=(0.0, 0.0, 1.0))
+    with torch.no_grad():
+        trajectory.control_points[:, :3] = 0.0
+    truth = Truth(trajectory, 5)
+    down = torch.tensor(imu.STANDARD_GRAVITY, dtype=F64)
+    with torch.no_grad():
+        q = SO3.inverse(truth.rotation_imu_body)
+        made = imu.measure(trajectory, truth.t[200:] - truth.offset, down, T_body_imu=torch.cat([0 * ARM, q]))
+    accel = made.accelerometer + 0.05 * torch.randn(made.accelerometer.shape, dtype=F64)
+    a = align_imu(trajectory, truth.t[200:], truth.gyro[200:], accel)
+    assert abs(a.accel_delay) < 0.02
+    assert any(note.startswith("accel_delay: the motion hardly tells it") for note in a.notes)
+
+
 @pytest.mark.slow
 def test_standard_deviations_are_those_of_many_draws():
     trajectory = motion(0, duration=10.0)
@@ -127,8 +169,11 @@ def test_plain_least_squares_agree_with_a_dense_solution():
     from scipy.optimize import least_squares
 
     trajectory = motion(1, duration=6.0)
-    truth = Truth(trajectory, 1, offset=0.1, skew=0.0, rate=60.0, span=(0.05, 0.95))
-    a = align_imu(trajectory, truth.t, truth.gyro, truth.accel, loss=None, estimate_skew=False)
+    truth = Truth(trajectory, 1, offset=0.1, skew=0.0, rate=60.0, span=(0.05, 0.95), delay=0.0)
+    a = align_imu(
+        trajectory, truth.t, truth.gyro, truth.accel, loss=None, estimate_skew=False, estimate_delay=False
+    )
+    assert a.accel_delay == 0.0
     assert a.used == (len(truth.t), len(truth.t))
     gyro, accel, t = truth.gyro, truth.accel, truth.t
     q0 = SO3.inverse(a.rotation_imu_body)

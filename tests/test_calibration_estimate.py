@@ -1,5 +1,6 @@
 """Calibrations of simulated recordings: estimates against the truth, deviations against errors, options, diagnoses."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -15,6 +16,7 @@ from torchspline.imu import ImuNoise, measure
 from torchspline.io import ImuRecord
 from torchspline.kernels.mode import use_kernels
 
+pytestmark = pytest.mark.usefixtures("compiled")
 F64 = torch.float64
 SHORT = {"seconds": 6.0, "images": 60, "samples": 1200, "spacing": 0.05}
 
@@ -302,10 +304,15 @@ def test_noise_stated_a_thousand_times_too_large(calibration, simulated, start):
 
 
 def test_noise_stated_far_too_small_is_named(simulated, start):
-    with pytest.raises(
-        ValueError, match=r"not determine all .* noise densities and pixel_sigma = 0.5 .* right size"
-    ):
-        calibrate(with_noise(simulated.recording, 1e-3), start, spacing=0.05, stretch=None)
+    quiet = with_noise(simulated.recording, 1e-3)
+    with pytest.raises(ValueError, match=r"noise densities and pixel_sigma = 0.5 .* right size") as caught:
+        calibrate(quiet, start, spacing=0.05, stretch=None)
+    message = str(caught.value)
+    assert "not determine all" in message
+    assert message.startswith("noise: ")
+    for sensor in ("gyroscope", "accelerometer"):
+        told = float(re.search(rf"{sensor} of imu0 (\d+) times as much", message).group(1))
+        assert told == pytest.approx(1000, rel=0.2)
 
 
 def test_a_recording_without_noise():

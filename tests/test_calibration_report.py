@@ -23,6 +23,7 @@ from torchspline.calibrate.simulate import Simulation, simulate
 from torchspline.cli.calibrate import rows
 from torchspline.io import ImuRecord, read_camchain, write_imu
 
+pytestmark = pytest.mark.usefixtures("compiled")
 SPACING = 0.05
 FILES = ("result.json", "camchain-imucam.yaml", "report.html")
 

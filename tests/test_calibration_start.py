@@ -76,6 +76,19 @@ def test_known_time_offsets_stay_where_they_are_not_estimated(simulated, recordi
     assert found.cameras[0].time_offset_sigma is None
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "mm"), (1e-3, "km"), (7.0, None)])
+def test_boards_in_other_units_are_named(recording, factor, unit):
+    """The motion they tell is not that of the accelerometer: its scale says by how much, before anything is solved."""
+    wrong = replace(recording.corners[0], xyz=recording.corners[0].xyz * factor, source="cam0.npz")
+    with pytest.raises(
+        ValueError, match=r"cam0 with imu0: cam0.npz: expected corners of the board in m"
+    ) as caught:
+        find_start(replace(recording.only(0), corners=(wrong,)))
+    told = float(re.search(r"multiplied by ([0-9.e+-]+[0-9])", str(caught.value)).group(1))
+    assert told == pytest.approx(1.0 / factor, rel=0.15)
+    assert (f"seem to be in {unit}" in str(caught.value)) if unit else "seem to be" not in str(caught.value)
+
+
 # ---------------------------------------------------------------------- board poses
 
 

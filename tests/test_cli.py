@@ -160,8 +160,10 @@ def test_real_recordings(
     spacing: str,
     gyroscope: float,
     accelerometer: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """No worse than 1.1 times a SciPy least-squares spline of the same order and spacing on the same window."""
+    monkeypatch.setenv("TORCHSPLINE_KERNELS", "auto")  # as for users, and several times as fast
     done = torchspline(
         "imu", shared_data / poses, "--recorded", shared_data / recorded, "--rate", "200", "--duration", "60",
         "--spacing", spacing, "--out", tmp_path,
@@ -173,7 +175,10 @@ def test_real_recordings(
 
 
 @pytest.mark.realdata
-def test_kitti_with_gravity_along_y(shared_data: Path, tmp_path: Path) -> None:
+def test_kitti_with_gravity_along_y(
+    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHSPLINE_KERNELS", "auto")
     done = torchspline(
         "imu", shared_data / "poses/kitti_00_gt.txt.gz", "--gravity", "[0, 9.80665, 0]", "--rate", "20",
         "--out", tmp_path,

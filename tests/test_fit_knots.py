@@ -40,9 +40,8 @@ def test_where_the_noise_ends_well_before_the_least_change(noise_slope, motion_s
     assert 11.5 < np.log(spacing) / np.log(RATIO) - 1 < 14.5  # equal at 12
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_nearly_as_good_as_the_best_of_many_spacings(seed):
-    """Positions with motion of all frequencies below 5 Hz, and white noise."""
+def motion_and_noise(seed):
+    """Times, positions with motion of all frequencies below 5 Hz and white noise, and true accelerations."""
     rng = np.random.default_rng(seed)
     t = torch.arange(0, 20, 1 / 120, dtype=torch.float64)
     frequency, phase = 2 * np.pi * rng.uniform(0.2, 5.0, (3, 12)), rng.uniform(0, 2 * np.pi, (3, 12))
@@ -53,7 +52,13 @@ def test_nearly_as_good_as_the_best_of_many_spacings(seed):
     )
     position, acceleration = waves.imag.sum(-1), (-(frequency**2) * waves.imag).sum(-1)
     measured = torch.from_numpy(position + 1e-3 * rng.normal(size=position.shape))
-    poses = torch.cat([measured, SO3.identity(len(t), dtype=torch.float64)], -1)
+    return t, torch.cat([measured, SO3.identity(len(t), dtype=torch.float64)], -1), acceleration
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_better_than_the_best_of_many_spacings(seed):
+    t, poses, acceleration = motion_and_noise(seed)
+    measured = poses[:, :3]
     inside = slice(60, -60)
 
     def error(dt):
@@ -61,8 +66,56 @@ def test_nearly_as_good_as_the_best_of_many_spacings(seed):
         fitted = knots.evaluate(knots.linear_fit(t, measured.numpy(), 1e-9), t[inside], derivative=2)
         return np.sqrt(np.square(fitted - acceleration[inside]).mean())
 
-    chosen = choose_spacing(t, poses, 6, 1e-9, None).position
-    assert error(chosen) < 1.2 * min(error(0.02 * RATIO**i) for i in range(14))
+    best = min(error(0.02 * RATIO**i) for i in range(14))
+    assert error(choose_spacing(t, poses, 6, 1e-9, None).position) < 1.2 * best
+    # Knots cut off sharply, and differently between them: a smoothing spline of that bandwidth has less of an error.
+    trajectory = fit_poses(t, poses, dt="auto", progress=False).trajectory
+    found = trajectory.kinematics(t[inside])
+    # Without turning, body and world are the same.
+    assert np.sqrt(np.square(found.acceleration[:, :3].detach().numpy() - acceleration[inside]).mean()) < best
+
+
+@pytest.mark.parametrize("step", [0.3, 0.01])
+def test_gaps_do_not_change_the_choice(step):
+    """Long ones, or pairs of poses that are missing."""
+    t, poses, _ = motion_and_noise(3)
+    whole = choose_spacing(t, poses, 6, 1e-9, None)
+    missing = torch.zeros(len(t), dtype=torch.bool)
+    for start in range(200, 2200, 400):
+        missing |= (t >= t[start]) & (t < t[start] + max(step, 2.5 / 120))
+    some = choose_spacing(t[~missing], poses[~missing], 6, 1e-9, None)
+    assert some.position == pytest.approx(whole.position, rel=0.35)
+    fit = fit_poses(t[~missing], poses[~missing], dt="auto", progress=False)
+    assert fit.position_residual.abs().max() < 6e-3
+    # What bridges a gap does not swing out.
+    middle = fit.trajectory(t).detach()[:, :3]
+    assert middle.abs().max() < 1.5 * poses[:, :3].abs().max()
+
+
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("nanoseconds", [False, True])
+@pytest.mark.parametrize("ratio", [0.7, 1.0, 1.4])
+def test_smoothing_is_a_filter_of_known_gain(order, nanoseconds, ratio):
+    """Of waves as fast as every other knot, half the amplitude is left."""
+    t = torch.arange(3000, dtype=torch.float64) / 300
+    spacing = 0.08
+    wave = torch.cos(ratio * np.pi / spacing * t)[:, None]
+    times = (t * 1e9).round().long() if nanoseconds else t
+    knots = Knots(times, spacing / 4, order)
+    smooth = knots.evaluate(knots.smooth_fit(times, wave.numpy(), spacing, 1 / 300), times)
+    inside = slice(600, -600)
+    gain = (smooth[inside] * wave.numpy()[inside]).sum() / np.square(wave.numpy()[inside]).sum()
+    assert gain == pytest.approx(1 / (1 + ratio ** (2 * order - 2)), abs=0.02)
+
+
+def test_smoothing_leaves_polynomials_alone():
+    """Up to where the penalised derivative begins; gaps included."""
+    t = torch.linspace(0, 5, 400, dtype=torch.float64)
+    t = t[(t < 2) | (t > 2.4)]
+    values = torch.stack([t**4 - 3 * t**2, 2 * t**3], -1).numpy()
+    knots = Knots(t, 0.1, 6)
+    smooth = knots.evaluate(knots.smooth_fit(t, values, 0.2, 5 / 400), t)
+    assert np.abs(smooth - values).max() < 1e-4 * np.abs(values).max()
 
 
 def test_bursts_do_not_ask_for_knots_between_them():

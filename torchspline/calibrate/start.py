@@ -14,7 +14,7 @@ from torchspline import checks
 from torchspline.calibrate.board import FEWEST, MISFIT, BoardPoses, board_poses, contradictions
 from torchspline.calibrate.recording import Corners, Recording
 from torchspline.fit import Alignment, align_imu, fit_poses
-from torchspline.groups.group import SE3
+from torchspline.groups.group import SE3, SO3
 from torchspline.io.camera import Camera
 from torchspline.io.records import ImuRecord
 from torchspline.splines.bspline import BSpline
@@ -47,6 +47,9 @@ _AROUND_GRAVITY = (0.5, 2.0)
 #: Least shares of the variance of gyroscope and accelerometer that the aligned spline explains, and errors (m/s^2)
 #: of the latter below which that does not matter.
 _TURNS_EXPLAINED, _FORCE_EXPLAINED, _SMALL_FORCE = 0.5, 0.9, 0.5
+#: The size of a board that is so many times wrong is in another unit, in one of these if it is this near.
+_WRONG_UNIT, _LIKE = 4.0, 0.15
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "km": 1e3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,6 +312,14 @@ def _aligned(
             f"{names}: gyroscope: expected readings of the motion that the images show, but no rotation of the sensor "
             f"makes it explain more than {max(turns, 0.0):.0%} of their variance: are axes mirrored or swapped?"
         )
+    size, left = _size(spline, imu, found)
+    if not 1.0 / _WRONG_UNIT < size < _WRONG_UNIT and left < 0.5 * miss:
+        source = recording.corners[i].source or f"corners[{i}]"
+        unit = next((name for name, x in _UNITS.items() if abs(size / x - 1.0) < _LIKE), "")
+        raise ValueError(
+            f"{names}: {source}: expected corners of the board in m, but the motion that they tell is that of the "
+            f"accelerometer only if it is multiplied by {size:.3g}{f': they seem to be in {unit}' if unit else ''}"
+        )
     if force < _FORCE_EXPLAINED and miss > _SMALL_FORCE:
         notes.append(
             f"{names}: the motion explains {max(force, 0.0):.0%} of the accelerometer's variance only: are its "
@@ -321,6 +332,41 @@ def _aligned(
             f"{names}: the clocks are {found.time_offset:.3f} s apart (t_imu = t_cam + {found.time_offset:.3f} s)"
         )
     return found
+
+
+def _size(spline: BSpline, imu: ImuRecord, found: Alignment) -> tuple[float, float]:
+    """By what the motion would have to be multiplied for the accelerometer to read it, and what is then left, m/s^2.
+
+    Rotation and clock do not depend on the size of the board: with those the readings are linear in the factor,
+    gravity, bias and lever arm.
+    """
+    t = found.pose_time(imu.time_ns)
+    inside = (t >= spline.domain[0]) & (t <= spline.domain[1])
+    with torch.no_grad():
+        motion = spline.kinematics(t[inside])
+    R, a, w, alpha = (
+        motion.rotation,
+        motion.acceleration,
+        motion.angular_velocity,
+        motion.angular_acceleration,
+    )
+    assert R is not None
+    assert a is not None
+    assert w is not None
+    assert alpha is not None
+    back, count = SO3.inverse(R), int(inside.sum())
+    read = SO3.act(SO3.inverse(found.rotation_imu_body), imu.accelerometer[inside].to(torch.float64))
+    axes = [e.expand(count, 3) for e in torch.eye(3, dtype=torch.float64)]
+    cross = torch.linalg.cross
+    lever = [cross(alpha, e) + cross(w, cross(w, e)) for e in axes]
+    columns = [SO3.act(back, a), *(SO3.act(back, e) for e in axes), *lever, *axes]
+    matrix = torch.stack(columns, dim=-1).reshape(3 * count, -1)
+    scale = matrix.norm(dim=0).clamp_min(1e-300)
+    # Without tilting gravity and bias are one: the least of both will do.
+    solved = torch.linalg.lstsq(matrix / scale, read.reshape(-1, 1), rcond=1e-6, driver="gelsd").solution
+    x = solved[:, 0] / scale
+    left = (matrix @ x - read.reshape(-1)).square().mean().sqrt()
+    return float(x[0]), float(left)
 
 
 def _explained(readings: Tensor, rms: float) -> float:

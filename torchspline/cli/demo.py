@@ -39,8 +39,10 @@ def demo(out: Path = Path("torchspline-demo"), duration: float = 20.0, seed: int
         duration: length of the motion, s.
         seed: of the random motion and noise.
     """
-    if not 2.0 <= duration <= _LONGEST:
-        raise ValueError(f"duration: expected at least 2 s and at most {_LONGEST:g} s, got {duration}")
+    if not duration >= 2.0:
+        raise ValueError(f"duration: expected at least 2 s, got {duration}")
+    if not duration <= _LONGEST:
+        raise ValueError(f"duration: expected at most {_LONGEST:g} s, got {duration}")
     out.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(seed)
     truth = _random_motion(duration, generator)

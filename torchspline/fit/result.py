@@ -24,6 +24,8 @@ Array = NDArray[Any]
 _OPEN = 1e-9
 #: Directions that are looked for.
 _DIRECTIONS = 12
+#: Of those, named in an error.
+_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -136,16 +138,20 @@ class Result:
     @property
     def _factor(self) -> Factor:
         if self._undamped is None:
-            open_ = "; ".join(map(str, self.observability)) or "rounding leaves no direction to name"
-            raise ValueError(f"covariance: the measurements do not determine all unknowns: {open_}")
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {self._open}")
         return self._undamped
 
     def _determined(self) -> Factor:
         if not self._surely_determined and self.observability:
-            raise ValueError(
-                f"covariance: the measurements do not determine all unknowns: {'; '.join(map(str, self.observability))}"
-            )
+            raise ValueError(f"covariance: the measurements do not determine all unknowns: {self._open}")
         return self._factor
+
+    @property
+    def _open(self) -> str:
+        """The first of the open directions, in words."""
+        named, more = self.observability[:_NAMED], len(self.observability) - _NAMED
+        words = "; ".join(map(str, named)) or "rounding leaves no direction to name"
+        return words + (f"; and {more} more" if more > 0 else "")
 
     @cached_property
     def _surely_determined(self) -> bool:

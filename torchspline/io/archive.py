@@ -122,7 +122,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Write an npz archive under exactly this name. Raises `FileNotFoundError` where the folder does not exist."""
     packed = io.BytesIO()  # archives go back to their beginning, which pipes cannot
-    np.savez(packed, allow_pickle=False, **arrays)
+    np.savez(packed, **arrays)  # type: ignore[arg-type]
     with replacing(path) as part:
         part.write_bytes(packed.getbuffer())
 

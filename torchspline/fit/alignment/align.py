@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -55,17 +55,25 @@ class Alignment:
     std: dict[str, Tensor | float]
     #: Readings of gyroscope and accelerometer within the trajectory's domain that were used.
     used: tuple[int, int]
+    #: s: by how much the accelerometer is later: its stamp of a moment is that of the gyroscope, to which `time_offset`
+    #: belongs, plus this; 0 if it was not estimated.
+    accel_delay: float = 0.0
     #: Things a careful user wants to know, in words.
     notes: list[str] = field(default_factory=list)
     #: First reading and start of the trajectory in their units, and the seconds that lie between them at `t_mid`.
     _clocks: tuple[float | int, float | int, float] = (0.0, 0.0, 0.0)
 
-    def pose_time(self, t: Tensor) -> Tensor:
+    def pose_time(self, t: Tensor, *, sensor: Literal["gyro", "accel"] = "gyro") -> Tensor:
         """Times of the trajectory, in its unit, at stamps `t` of the IMU's clock, in the unit they came in.
 
+        Args:
+            t: stamps, any shape.
+            sensor: whose readings have these stamps; those of the two are `accel_delay` apart.
         Raises:
             TypeError: no tensor, or not the dtype of the stamps that were aligned.
+            ValueError: no such sensor.
         """
+        checks.choice("sensor", sensor, ("gyro", "accel"))
         first, origin, lag = self._clocks
         checks.instance("t", t, Tensor, "a torch.Tensor")
         expected = torch.int64 if isinstance(first, int) else torch.float64
@@ -74,7 +82,8 @@ class Alignment:
         # Before the factor: torch makes float32 of whole numbers times a float.
         s = (t - first).to(torch.float64) * (NANOSECOND if isinstance(first, int) else 1.0)
         mid = (self.t_mid - origin) * (NANOSECOND if isinstance(origin, int) else 1.0)
-        tau = mid + (s - lag - mid) / (1.0 + self.clock_skew)
+        late = self.accel_delay if sensor == "accel" else 0.0
+        tau = mid + (s - lag - mid - late) / (1.0 + self.clock_skew)
         return origin + nanoseconds(tau) if isinstance(origin, int) else origin + tau
 
     @property
@@ -93,6 +102,7 @@ def align_imu(
     *,
     max_offset: float | None = 5.0,
     estimate_skew: bool = True,
+    estimate_delay: bool = True,
     gravity_magnitude: float | None = _MAGNITUDE,
     loss: Loss | None = GemanMcClure(5.0),  # noqa: B008  (never changed)
 ) -> Alignment:
@@ -111,6 +121,8 @@ def align_imu(
         gyro, accel: (N, 3) rad/s and specific force m/s^2. Rows with NaN are left out, each sensor by itself.
         max_offset: how far the clocks may be apart, s; None for any distance at which the two overlap.
         estimate_skew: whether the clocks may run at different rates.
+        estimate_delay: whether the accelerometer may be later than the gyroscope, or earlier: the filters on many chips
+            differ by some tenths of a millisecond, and one clock for both would be right for neither.
         gravity_magnitude: m/s^2; None to estimate it, too.
         loss: how residuals far out count, in standard deviations; up to a fifth of the readings may be wrong. None for
             plain least squares.
@@ -122,6 +134,7 @@ def align_imu(
     """
     _check(trajectory, t, gyro, accel)
     checks.instance("estimate_skew", estimate_skew, bool, "True or False")
+    checks.instance("estimate_delay", estimate_delay, bool, "True or False")
     for name, x in (("max_offset", max_offset), ("gravity_magnitude", gravity_magnitude)):
         if x is not None:
             checks.positive(name, x)
@@ -132,16 +145,17 @@ def align_imu(
     stamps = _Stamps(t, body)
     sensors = [_clean("gyro", stamps.s, gyro)] + ([] if accel is None else [_clean("accel", stamps.s, accel)])
     start = _start(body, stamps, sensors[0], max_offset, alone=accel is None)
-    joint = Joint(body, stamps.epoch, sensors, start, estimate_skew, gravity_magnitude, loss)
+    joint = Joint(body, stamps.epoch, sensors, start, estimate_skew, estimate_delay, gravity_magnitude, loss)
     return _alignment(body, stamps, joint.run())
 
 
 def _alignment(trajectory: BSpline, stamps: "_Stamps", found: Solution) -> Alignment:
     values, accel = found.values, len(found.used) > 1
-    skew = values.get("clock_skew")
+    skew, delay = values.get("clock_skew"), values.get("accel_delay")
     return Alignment(
         time_offset=stamps.epoch + found.lag,
         clock_skew=0.0 if skew is None else float(skew[0]),
+        accel_delay=0.0 if delay is None else float(delay[0]),
         t_mid=align_start.times_of(trajectory, np.array([found.mid]))[0].item(),
         rotation_imu_body=SO3.inverse(values["rotation_imu_body"]),
         lever_arm=values.get("lever_arm"),
@@ -150,7 +164,10 @@ def _alignment(trajectory: BSpline, stamps: "_Stamps", found: Solution) -> Align
         gravity=values.get("gravity"),
         gyro_rms=found.rms[0],
         accel_rms=found.rms[1] if accel else None,
-        std={n: float(x[0]) if n in ("time_offset", "clock_skew") else x for n, x in found.std.items()},
+        std={
+            n: float(x[0]) if n in ("time_offset", "clock_skew", "accel_delay") else x
+            for n, x in found.std.items()
+        },
         used=(found.used[0], found.used[1] if accel else 0),
         notes=found.notes,
         _clocks=(stamps.first, stamps.origin, found.lag),

@@ -1,6 +1,7 @@
 """All unknowns of an alignment at once: the least-squares problem and how sure its solution is."""
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -21,12 +22,15 @@ from torchspline.splines.bspline import BSpline
 Array = NDArray[Any]
 #: Fewer readings than this are no recording.
 FEWEST = 30
+#: What is known of the delay between the sensors beforehand, s: filters on one chip are not farther apart than this.
+_DELAY = 5e-3
 #: Solutions, each weighted by the residuals of the one before.
 _ROUNDS = 5
 #: Standard deviations beyond which an estimate counts as not determined: its name, the limit, its unit.
 _LIMITS = {
     "time_offset": (0.01, "s"),
     "clock_skew": (0.01, "s/s"),
+    "accel_delay": (0.002, "s"),
     "rotation_imu_body": (0.1, "rad"),
     "lever_arm": (0.2, "m"),
     "gyro_bias": (0.05, "rad/s"),
@@ -65,6 +69,7 @@ class Joint:
         sensors: list[Readings],
         start: align_start.Start,
         skew: bool,
+        delay: bool,
         magnitude: float | None,
         loss: Loss | None,
     ):
@@ -82,6 +87,8 @@ class Joint:
         self.mid = 0.5 * float(self.used[0].s[0] + self.used[0].s[-1]) - start.lag
         self.offset = Variable("time_offset", torch.zeros(1, dtype=torch.float64))
         self.skew = Variable("clock_skew", torch.zeros(1, dtype=torch.float64)) if skew else None
+        both = delay and len(sensors) > 1
+        self.delay = Variable("accel_delay", torch.zeros(1, dtype=torch.float64)) if both else None
         self.arguments = self._arguments(magnitude)
         self.notes: list[str] = []
 
@@ -112,9 +119,13 @@ class Joint:
         problem = Problem(self.trajectory)
         mid = align_start.times_of(self.trajectory, np.array([self.mid]))[0].item()
         clock = Clock(offset=self.offset, skew=self.skew, mid=mid)
+        clocks = [clock, clock]
+        if self.delay is not None:
+            late = torch.ones(len(self.used[1].s), dtype=torch.float64)
+            clocks[1] = replace(clock, delay=self.delay, late=late)
         kinds = RESIDUALS["Gyroscope"], RESIDUALS["Accelerometer"]
-        for kind, readings, sigma, arguments in zip(
-            kinds, self.used, self.sigmas, self.arguments, strict=False
+        for kind, readings, sigma, arguments, clock in zip(
+            kinds, self.used, self.sigmas, self.arguments, clocks, strict=False
         ):
             t = align_start.times_of(self.trajectory, readings.s - self.start.lag)
             residual: Residual = kind(
@@ -126,6 +137,8 @@ class Joint:
                 **cast(Any, arguments),
             )
             problem.add(residual)
+        if self.delay is not None:
+            problem.add_prior(self.delay, sigma=_DELAY)
         problem.freeze(problem.trajectory)
         return problem
 
@@ -152,7 +165,7 @@ class Joint:
         with torch.no_grad():
             problem = self._solve()
             errors = self._residuals(problem)
-            covariances = _covariances(problem)
+            covariances = _covariances(problem, {} if self.delay is None else {"accel_delay": _DELAY**-2})
         std = {name: _deviations(problem.variables[name], c) for name, c in covariances.items()}
         offset = float(self.offset.value[0])
         self._note(std, offset, errors)
@@ -209,8 +222,10 @@ def _spread(error: Array, robust: bool) -> float:
     return max(float(np.median(np.linalg.norm(error, axis=1))) / align_start.MEDIAN_LENGTH, 1e-9)
 
 
-def _covariances(problem: Problem) -> dict[str, Array]:
+def _covariances(problem: Problem, known: dict[str, float]) -> dict[str, Array]:
     """Of the tangent of each variable, robust losses taken into account; infinite where nothing is known.
+
+    `known` is what priors tell of variables by name.
 
     An M-estimate has the covariance `A^-1 B A^-1`, with A the mean curvature of the cost and B that of the squares of
     its gradient [Huber 1981, 7.6]; with weights of one, (J^T J)^-1 times the variance of the residuals. The errors of
@@ -245,6 +260,10 @@ def _covariances(problem: Problem) -> dict[str, Array]:
         plain /= max(float(weight.mean()), 1e-12)
         curvature += plain * float((weight + 2.0 / 3.0 * bend * lengths).mean())
         squares += plain * float((weight**2 * lengths).mean()) / 3.0
+    for name, information in known.items():
+        own = model.columns[id(problem.variables[name])].reshape(-1)
+        curvature[own, own] += information
+        squares[own, own] += information
     inverse, unknown = _pseudo_inverse(curvature)
     covariance = inverse @ squares @ inverse
     covariance[np.diag_indices_from(covariance)] = np.where(unknown, np.inf, np.diagonal(covariance))
@@ -256,7 +275,7 @@ def _covariances(problem: Problem) -> dict[str, Array]:
 
 
 def _terms(linearizer: Linearizer) -> list[Term]:
-    """Those of the sensors; there are no priors here."""
+    """Those of the sensors."""
     return [term for term in linearizer.terms if isinstance(term, Term)]
 
 

@@ -38,7 +38,8 @@ class PoseFit:
     duplicates: int
     #: Stretches (start, end), in the unit of the times, of more than two knot intervals without a pose.
     gaps: list[tuple[float, float]]
-    #: Half the weighted sum of squares after the linear start and after each iteration.
+    #: Half the weighted sum of squares after the linear start and after each iteration; where dt="auto" smooths, of
+    #: what is left to the smoothed poses.
     cost: list[float]
     #: Why the iteration stopped.
     reason: str
@@ -77,8 +78,9 @@ def fit_poses(
         t: (N,) seconds (float64) or int64 nanoseconds; in any order, duplicates allowed.
         poses: (N, 7) [x, y, z, qw, qx, qy, qz], body to world; rows with NaN are left out.
         dt: knot spacing, seconds. What it should be depends on the data: a wrong spacing costs more than anything.
-            "auto" finds one from the data, see `knots.choose_spacing`, and says why in the notes; positions of a split
-            trajectory may then be as smooth as a spline of a wider one.
+            "auto" finds one from the data, see `knots.choose_spacing`, for positions and for rotations, and says why in
+            the notes. Knots are then half as far apart, and go through smoothing splines of that bandwidth, which is
+            better than knots that far apart; with few poses, or an `accuracy`, these it is.
         order: of the spline, 2 or more; IMU synthesis wants at least 4, better 6.
         representation: "split" (R3 x SO3) or "joint" (SE3).
         position_sigma, rotation_sigma: what a residual of one weighs, m and rad; matters to "joint" only.
@@ -178,7 +180,10 @@ def fit_poses(
     dropped, duplicates = int((~usable).sum()), len(times) - distinct
     notes = _notes(rows, dropped, duplicates, gaps, len(times), knots)
     if spacing is not None:
-        notes.insert(0, f"knots {width * 1e3:.4g} ms apart: {spacing.reason}")
+        smoothed = (
+            ", in smoothing splines that pass what splines of such knots pass" if spacing.smooth else ""
+        )
+        notes.insert(0, f"knots {width * 1e3:.4g} ms apart: {spacing.reason}{smoothed}")
     return PoseFit(
         trajectory, residual[0], residual[1], dropped, duplicates, gaps, trace.cost, trace.reason, notes
     )

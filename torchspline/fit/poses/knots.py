@@ -101,7 +101,7 @@ class Knots:
         `omega_half = pi / spacing`, but have another gain beside knots than between them.
 
         Args:
-            spacing: above that of these knots, s. step: usual distance of the times, s.
+            spacing: above that of these knots, s. step: mean distance of the times but for gaps, s.
         """
         m = self.order - 1
         first, u = self.place(times)
@@ -174,15 +174,17 @@ class Spacing:
     rotation: float
     position: float
     reason: str
-    #: Usual distance of the times, s, and whether they are so many that smoothing is better than wide knots.
+    #: Mean distance of the times but for gaps, the narrowest spacing they allow, s; whether they are so many that
+    #: smoothing is better than wide knots.
     step: float = 0.0
+    narrow: float = 0.0
     smooth: bool = False
 
     @property
     def knots(self) -> float:
         """Spacing of knots for the fit: so narrow that smoothing decides, not they."""
         narrower = min(self.rotation, self.position)
-        return max(narrower / 2, min(_LEAST_POSES * self.step, narrower)) if self.smooth else narrower
+        return max(narrower / 2, min(self.narrow, narrower)) if self.smooth else narrower
 
 
 def choose_spacing(
@@ -204,9 +206,9 @@ def choose_spacing(
     steps = times.diff().to(torch.float64)
     steps = steps[steps > 0] * unit
     # Poses may come in bursts, and with gaps between them.
-    usual = steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)]
-    span, step = float(steps.sum()), max(float(steps.median()), float(usual.mean()))
-    narrow = _LEAST_POSES * step
+    usual = float(steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)].mean())
+    apart = steps[steps > 0.1 * usual]
+    span, narrow = float(steps.sum()), _LEAST_POSES * max(float(apart.median()), usual)
     widest = max(span / _LEAST_INTERVALS, narrow)
     tried: list[float] = []
     misses: list[tuple[float, float]] = []
@@ -248,7 +250,7 @@ def choose_spacing(
         f"judged by how fits at near spacings differ, {rotation * 1e3:.3g} ms suit angular velocity (difference "
         f"{turns:.3g} rad/s) and {position * 1e3:.3g} ms acceleration ({pulls:.3g} m/s^2)"
     )
-    return Spacing(rotation, position, reason, step, smooth=len(steps) > 2 * order)
+    return Spacing(rotation, position, reason, usual, narrow, smooth=len(apart) > 2 * order)
 
 
 def _per_axis(x: FloatArray) -> float:
