@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import examples
 
 import torchspline as ts
 from torchspline import Group
@@ -75,7 +76,7 @@ def size(*tensors):
 
 
 each_group = pytest.mark.parametrize("name", GROUPS)
-fast = settings(max_examples=40)
+fast = examples(40)
 
 
 @each_group
@@ -170,7 +171,7 @@ def test_length_and_sign_of_stored_numbers_do_not_matter(name, dtype):
 def test_gradients_are_finite_at_the_edges(name):
     group = Group(name)
 
-    @settings(max_examples=25)
+    @examples(25)
     @given(tangents(name), tangents(name))
     def check(x, y):
         x = x.clone().requires_grad_()

@@ -240,6 +240,8 @@ def test_pytorch_kinematics_agrees_up_to_float32():
     text = plain(URDF).replace('<origin xyz="0.4 0.05 0"/>', '<origin xyz="0.4 0.05 0"/><axis xyz="1 0 0"/>')
     chain = pk.build_chain_from_urdf(text.encode()).to(dtype=F64)
     robots = (Robot.from_urdf(text), Robot.from_chain(chain))
+    if not hasattr(chain, "forward_kinematics_tensor"):
+        pytest.skip("pytorch-kinematics before 0.9 gives no plain matrices to compare with")
     q = random(3, 6)
     expected = chain.forward_kinematics_tensor(q)
     for robot, tolerance in zip(robots, (5e-7, 5e-7), strict=True):

@@ -1,15 +1,15 @@
 """What holds for every family of splines on any group, order, clock, batch and control points, looked for with
-Hypothesis: the same few examples in every run, or thousands of random ones with TORCHSPLINE_EXAMPLES=5000."""
+Hypothesis."""
 
-import os
 from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 import torch
 from batteries import generator, hat, normal, rescaled, rotation_blocks, tangents
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import examples
 from spline_cases import chain
 from torch import Tensor
 
@@ -21,9 +21,10 @@ F32, F64 = torch.float32, torch.float64
 EPS = torch.finfo(F64).eps
 GROUPS = ("SO3", "SE3", "DualQuaternion", "SO2", "SE2", "R1", "R3", "R3xSO3", "SE2xR2xSO3")
 ABELIAN = ("SO2", "R1", "R3")
+#: Schemes that add up stored numbers, such as quaternions.
+BLENDS = ("linear", "bernstein", "bspline", "composite_bezier")
 
-HUNT = int(os.environ.get("TORCHSPLINE_EXAMPLES", "0"))
-some = settings(max_examples=HUNT or 10, derandomize=not HUNT, deadline=None, database=None, print_blob=True)
+some = examples(10)
 each_family = pytest.mark.parametrize("family", ["uniform", "nonuniform", "hermite", "keyframes"])
 
 #: Rotation between neighbours; other components move about as far.
@@ -424,21 +425,16 @@ def test_uniform_motion_is_reproduced(family):
     @some
     @given(curves(family), places, seeds)
     def check(curve, u, seed):
-        group, count = curve.group, len(curve.points)
-        at = curve.knots
+        group, count, at = curve.group, len(curve.points), curve.knots
+        method = dict(curve.options).get("method")
         if family == "uniform":
             at = (torch.arange(count, dtype=F64) - (curve.order - 2) / 2) * (at[1] - at[0]) + at[0]
         elif family == "nonuniform":  # Greville's places
             at = curve.all_knots().unfold(0, curve.order + 1, 1)[:, 1:-1].mean(-1)
-        elif (
-            dict(curve.options).get("method") in ("linear", "bernstein", "bspline")
-            and group.name not in ABELIAN[1:]
-        ):
+        elif method in BLENDS and group.name not in ("R1", "R3"):
             return  # blends of numbers do not turn steadily
-        elif dict(curve.options).get("method") not in (None, "geodesic", "linear"):
-            at = curve.knots[0] + torch.arange(count, dtype=F64) * (curve.knots[-1] - curve.knots[0]) / (
-                count - 1
-            )
+        elif method not in (None, "geodesic", "linear"):
+            at = at[0] + torch.arange(count, dtype=F64) * (at[-1] - at[0]) / (count - 1)
         speed = tangents(group, [2.0], each=1, seed=seed)[0] / at.diff().max()
         start = group.random(generator=generator(seed))
 
@@ -470,9 +466,7 @@ def test_time_may_run_backwards(family):
     @given(curves(family), places)
     def check(curve, u):
         method = dict(curve.options).get("method")
-        if curve.group.name not in ABELIAN and (
-            family != "keyframes" or method in ("cumulative_bspline", "composite_bezier")
-        ):
+        if curve.group.name not in ABELIAN and (family != "keyframes" or method == "cumulative_bspline"):
             return
         t = curve.times(u)
         back = replace(
