@@ -111,6 +111,22 @@ def test_every_public_name_is_in_the_reference(module):
     assert not missing, f"not in torchspline/docs/reference: {missing}"
 
 
+def test_table_of_residuals():
+    text = (DOCS / "reference" / "fit.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| \(N, (\w)\) \|", text, re.M))
+    residuals = {
+        name: x
+        for name, x in vars(torchspline.fit).items()
+        if isinstance(x, type)
+        and issubclass(x, torchspline.fit.Residual)
+        and x is not torchspline.fit.Residual
+    }
+    assert set(rows) == set(residuals), "a line for each residual"
+    for name, kind in residuals.items():
+        of_group = "P" if name == "StateValue" else "D"
+        assert rows[name] == (of_group if kind.measured_size is None else str(kind.measured_size)), name
+
+
 def test_the_reference_says_what_things_are():
     for path, x in reference().items():
         if x is None:
