@@ -300,6 +300,7 @@ def _aligned(
             imu.accelerometer,
             max_offset=max_offset,
             estimate_skew=False,
+            estimate_delay=False,
             gravity_magnitude=recording.gravity,
         )
     except ValueError as error:
