@@ -390,6 +390,35 @@ def test_readings_of_another_motion(max_offset):
         align_imu(motion(15), truth.t, truth.gyro, truth.accel, max_offset=max_offset)
 
 
+@pytest.mark.parametrize(
+    ("mistake", "word"),
+    [
+        (lambda x: x / 9.80665, "accel: the motion leaves"),
+        (lambda x: 0 * x, "accel: the motion leaves"),
+        (lambda x: -x, "accel: the motion leaves"),
+        (lambda x: x.roll(60, 0), "accel_delay: 0.3 s"),
+    ],
+    ids=["in g", "zero", "negated", "late"],
+)
+def test_an_accelerometer_that_reads_something_else_is_noted(mistake, word):
+    trajectory = motion(4)
+    truth = Truth(trajectory, 5)
+    found = align_imu(trajectory, truth.t, truth.gyro, mistake(truth.accel))
+    assert any(note.startswith(word) for note in found.notes), found.notes
+    assert align_imu(trajectory, truth.t, truth.gyro, truth.accel).notes == []
+
+
+@pytest.mark.parametrize("nanoseconds", [False, True])
+def test_a_stamp_far_before_the_others_does_not_matter(nanoseconds):
+    trajectory = motion(4)
+    truth = Truth(trajectory, 5)
+    t = (truth.t * SECOND).long() if nanoseconds else truth.t.clone()
+    whole = align_imu(trajectory, t, truth.gyro)
+    t[0] = -9 * 10**18 if nanoseconds else -1e7
+    found = align_imu(trajectory, t, truth.gyro)
+    assert found.time_offset == pytest.approx(whole.time_offset, abs=1e-5)
+
+
 def test_an_offset_beyond_the_limit():
     trajectory = motion(14)
     truth = Truth(trajectory, 14, offset=3.0)

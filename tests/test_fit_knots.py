@@ -140,3 +140,46 @@ def test_an_accuracy_asked_for_is_kept(accuracy):
     for reached, limit in zip(fit.rms(), accuracy, strict=True):
         assert reached <= limit * 1.02
     assert fit.trajectory.dt > 0.03
+
+
+def swinging(t):
+    """Poses of a slow motion with noise of 1 mm and 1 mrad, and the motion."""
+    noise = 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=(len(t), 6)))
+    angle = torch.sin(0.8 * t)[:, None] * torch.tensor([[0.3, 0.1, -0.2]], dtype=torch.float64)
+    position = torch.stack([torch.cos(t), torch.sin(1.3 * t), torch.sin(0.5 * t)], dim=-1)
+    rotation = SO3.exp(angle)
+    measured = SO3.compose(rotation, SO3.exp(noise[:, 3:]))
+    return torch.cat([position + noise[:, :3], measured], -1), torch.cat([position, rotation], -1)
+
+
+@pytest.mark.parametrize("nanoseconds", [False, True])
+@pytest.mark.parametrize(
+    "t",
+    [
+        torch.cat([torch.arange(0, 4, 1 / 100), torch.arange(4, 30, 1.0)]),
+        (torch.arange(12)[:, None] * 4.0 + 0.01 * torch.arange(25)).reshape(-1),
+        torch.logspace(-6, 1, 300),
+    ],
+    ids=["slower later", "short stretches", "logarithmic"],
+)
+def test_poses_that_are_alone_count(t, nanoseconds):
+    """Where most others are close together."""
+    t = t.double()
+    measured, truth = swinging(t)
+    times = (t * 1e9).round().long() if nanoseconds else t
+    fit = fit_poses(times, measured, dt="auto", progress=False)
+    assert max(fit.rms()) < 1.5e-3
+    found = fit.trajectory(times).detach()
+    assert (found[:, :3] - truth[:, :3]).abs().max() < 5e-3
+    assert SO3.log(SO3.between(found[:, 3:], truth[:, 3:])).abs().max() < 5e-3
+
+
+@pytest.mark.parametrize("times", [[0, 1_700_000_000_000_000_000], [-9_000_000_000_000_000_000, 0]])
+def test_times_far_apart_are_named(times):
+    """Beyond what differences of 64 bits hold, too."""
+    t = torch.cat([torch.tensor(times[:1]), times[1] + 20_000_000 * torch.arange(50)])
+    measured, _ = swinging((t - t[1]) * 1e-9)
+    with pytest.raises(
+        ValueError, match=rf"^t: .* are mostly 0\.02 s apart, .* from {times[0]} to {times[1]} "
+    ):
+        fit_poses(t, measured, dt="auto", progress=False)

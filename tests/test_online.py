@@ -586,3 +586,29 @@ def test_a_spline_of_biases_that_starts_long_is_used_as_far_as_measurements_came
     early = Gyroscope(t[-40:], torch.zeros(40, 3, dtype=F64), bias=late)
     with pytest.raises(ValueError, match=r"bias: .* lie outside the domain .* of its spline"):
         window.add(early)
+
+
+@pytest.mark.parametrize("nanoseconds", [False, True])
+def test_a_bias_spline_may_begin_long_before_the_window(nanoseconds):
+    """What no measurement sees costs nothing."""
+    unit = 10**9 if nanoseconds else 1.0
+    clock = (lambda dt, t0: {"dt_ns": round(dt * unit), "t0_ns": round(t0 * unit)}) if nanoseconds else None
+    clock = clock or (lambda dt, t0: {"dt": dt, "t0": t0})
+    found = []
+    for early in (0.0, 400.0):
+        points = torch.zeros(int(2 * early) + 3, 3, dtype=F64)
+        bias = ts.BSpline(points, group=R3, order=2, learnable=False, **clock(0.5, -early))
+        window = SlidingWindow(SO3.identity(dtype=F64), group=SO3, window=1.0, **clock(0.2, 0.0))
+        window.random_walk(bias, 0.1)
+        for s in packets(3.0, 20, 10):
+            t = (s * unit).round().to(torch.int64) if nanoseconds else s
+            turn = torch.tensor([0.3, 0.1, -0.2], dtype=F64)
+            window.add(StateValue(t, SO3.exp(s[:, None] * turn), sigma=0.01))
+            window.add(Gyroscope(t, turn + 0.1 * s[:, None], sigma=0.01, bias=bias))
+            window.update(**EXACT)
+        assert len(window._wandering[bias].active.control_points) < 12
+        at = torch.linspace(0, 2.9, 30, dtype=F64) * unit
+        found.append(bias(at.round().to(torch.int64) if nanoseconds else at))
+        before = max(int(2 * early) - 4, 0)
+        assert torch.equal(bias.control_points[:before], points[:before])
+    assert_allclose(found[1], found[0], atol=1e-6)

@@ -273,9 +273,13 @@ def _start(
         raise ValueError(
             f"t: expected recordings of less than {_MOST_BINS * align_start.STEP:g} s, but {spans}"
         )
-    found = align_start.start(trajectory, gyro.s, gyro.x, lags)
+    # From the first that may overlap: one stamp may be far before the others.
+    first = float(gyro.s[0])
+    found = align_start.start(trajectory, gyro.s - first, gyro.x, (lags[0] - first, lags[1] - first))
     if found is None:
         raise apart
+    rival = found.rival and (found.rival[0] + first, found.rival[1])
+    found = found._replace(lag=found.lag + first, rival=rival)
     if found.turning < 0.01:
         raise ValueError(
             f"trajectory: its angular speed varies by {found.turning:.2g} rad/s only: with so little turning neither "

@@ -39,6 +39,15 @@ _LIMITS = {
 }
 
 
+#: Residuals of more than this share of how readings vary are worth a word, and delays of more than so many `_DELAY`.
+_UNEXPLAINED, _LONG = 0.4, 4.0
+#: What each sensor is taken to read.
+_READS = {
+    "gyro": ("rad/s", "rad/s"),
+    "accel": ("m/s²", "specific force in m/s², which at rest points up, and is gravity_magnitude right"),
+}
+
+
 class Readings(NamedTuple):
     """Of one sensor, in order of time: `s` (N,) seconds from the first stamp, `x` (N, 3)."""
 
@@ -197,6 +206,17 @@ class Joint:
                 f"time_offset: {self.epoch + rival[0]:.4g} s explains the gyroscope almost as well "
                 f"({rival[1]:.1%} of its variance, the one chosen {best:.1%}): the motion repeats itself"
             )
+        delay = 0.0 if self.delay is None else float(self.delay.value[0])
+        if abs(delay) > _LONG * _DELAY:
+            self.notes.append(f"accel_delay: {delay:.3g} s, more than the filters of a chip make")
+        for name, error, readings in zip(("gyro", "accel"), errors, self.used, strict=False):
+            left, there = (_spread(x, True) for x in (error, readings.x - np.median(readings.x, axis=0)))
+            if left > _UNEXPLAINED * there:
+                unit, expected = _READS[name]
+                self.notes.append(
+                    f"{name}: the motion leaves {left:.3g} {unit} of readings that vary by {there:.3g}; vibrations, or "
+                    f"do the knots miss the motion, is it the same body, are the readings {expected}?"
+                )
         for name, error, sigma in zip(("gyro", "accel"), errors, self.sigmas, strict=False):
             share = float(np.mean(np.linalg.norm(error, axis=1) > 6.0 * sigma))
             if share > 0.01:

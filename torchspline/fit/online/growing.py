@@ -126,6 +126,11 @@ class Wandering(Growing):
         """By how much it changes in a second, (n,)."""
         self.weight = 1.0 / (sigma * self.spacing**0.5)
 
+    def begin(self, t: float | int) -> None:
+        """Leave control points alone that matter only before a time, unless measurements have come up to them."""
+        if not self.used:
+            self.first = max(min(int((t - self.t0) // self.dt), self.count - self.order), 0)
+
     def reach(self, t: float | int) -> None:
         """Use control points up to a time."""
         segments = -int((self.t0 - t) // self.dt)

@@ -181,6 +181,8 @@ class SlidingWindow:
         for own, ahead in wandering.items():
             own.append(ahead)
             if latest is not None:
+                # A window earlier, as clocks may turn out otherwise.
+                own.begin(self._grown.knot(self._first) - self._segments * self._dt)
                 own.reach(latest)
         self._variables.update({v.name: v for v in variables_of(residual)})
         # A copy of the measurements: buffers that packets arrive in may be used again.
@@ -238,7 +240,7 @@ class SlidingWindow:
         A `Variable` is one value within the window, and steps where control points leave it. A spline in R^n changes
         within the window: it steps from control point to control point. Control points are appended to it as
         measurements come that depend on it, where its last one stands, and are moved in place by every update; those
-        that leave the window stay as they are.
+        that leave the window, or lie before it by more than its length, stay as they are.
 
         Args:
             variable: or a spline, float64, whose domain begins before the measurements.

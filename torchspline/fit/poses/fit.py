@@ -224,7 +224,8 @@ def _start(knots: Knots, times: Tensor, measured: Tensor, group: Group, smoothne
 def _smoothed(knots: Knots, times: Tensor, measured: Tensor, spacing: Spacing) -> tuple[Tensor, Tensor]:
     """Poses on a smooth curve through those measured, at times that are dense among the knots; none within gaps."""
     grid = knots.grid(3)
-    grid = grid[knots.among(grid, times)]
+    # Beside gaps at the times measured: poses may be there alone.
+    grid = torch.cat([grid[knots.among(grid, times)], times[knots.beside_gaps(times)]]).unique()
     parts = []
     for columns, wide in ((slice(0, 3), spacing.position), (slice(3, 7), spacing.rotation)):
         own = Knots(times, max(wide / 2, knots.seconds), knots.order)

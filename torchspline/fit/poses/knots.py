@@ -17,6 +17,8 @@ from torchspline.units import NANOSECOND, SECOND, unit_of
 _RATIO = 2**0.25
 #: Fewest poses a knot interval that are tried, and knot intervals.
 _LEAST_POSES, _LEAST_INTERVALS = 1.5, 6
+#: So many times the order of poses close together are a recording by themselves, fewer a burst.
+_RUN = 2
 #: How often worse than the best so far ends the search.
 _GIVE_UP = 5.0
 #: A minimum is one if what follows rises by this factor.
@@ -131,6 +133,12 @@ class Knots:
         after = torch.searchsorted(times, grid).clamp(1, len(times) - 1)
         return (times[after] - times[after - 1] <= 2 * self.dt) & (grid <= times[-1])
 
+    def beside_gaps(self, times: Tensor) -> Tensor:
+        """Which times begin or end one of the `gaps`, or are the last."""
+        wide = times.diff() > 2 * self.dt
+        edge = torch.ones(1, dtype=torch.bool)
+        return torch.cat([wide, edge]) | torch.cat([~edge, wide])
+
     def _across_gaps(self, times: Tensor, values: FloatArray) -> tuple[Tensor, FloatArray]:
         """Times within gaps, and the straight lines across."""
         grid = self.grid(1)
@@ -206,9 +214,18 @@ def choose_spacing(
     steps = times.diff().to(torch.float64)
     steps = steps[steps > 0] * unit
     # Poses may come in bursts, and with gaps between them.
-    usual = float(steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)].mean())
-    apart = steps[steps > 0.1 * usual]
-    span, narrow = float(steps.sum()), _LEAST_POSES * max(float(apart.median()), usual)
+    span, (usual, apart) = (times[-1].item() - times[0].item()) * unit, _usual(steps)
+    if len(steps) > _RUN * order * len(apart):
+        # No bursts, but stretches that are recordings by themselves.
+        usual, apart = _usual(steps[steps <= 0.1 * usual])
+    narrow = _LEAST_POSES * max(float(apart.median()), usual)
+    if span / narrow > 1_000_000 and span / narrow > 1000 * len(times):
+        longest = int(times.to(torch.float64).diff().argmax())
+        raise ValueError(
+            f"t: the {len(times)} usable times are mostly {usual:.3g} s apart, but span {span:.3g} s, from "
+            f"{times[longest].item()!r} to {times[longest + 1].item()!r} without any; expected one recording: correct "
+            "the times, fit the parts by themselves, or give dt"
+        )
     widest = max(span / _LEAST_INTERVALS, narrow)
     tried: list[float] = []
     misses: list[tuple[float, float]] = []
@@ -251,6 +268,12 @@ def choose_spacing(
         f"{turns:.3g} rad/s) and {position * 1e3:.3g} ms acceleration ({pulls:.3g} m/s^2)"
     )
     return Spacing(rotation, position, reason, usual, narrow, smooth=len(apart) > 2 * order)
+
+
+def _usual(steps: Tensor) -> tuple[float, Tensor]:
+    """Mean of steps but for the longest, and the steps but for those within bursts."""
+    usual = float(steps.sort().values[: max(math.ceil(0.99 * len(steps)), 1)].mean())
+    return usual, steps[steps > 0.1 * usual]
 
 
 def _per_axis(x: FloatArray) -> float:
