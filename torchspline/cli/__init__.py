@@ -1,5 +1,6 @@
 """The command line. `COMMANDS` lists the commands; a new one is a module beside this one and a line in it."""
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -41,7 +42,18 @@ COMMANDS: dict[str, Command] = {
     "info": Command(f"{_HERE}.info", "info", "what is in a file"),
     "kernels show": Command(f"{_HERE}.kernels", "show", "the source of a compiled loop"),
 }
-_EXPECTED = (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError)
+_EXPECTED = (TypeError, ValueError, OSError, MemoryError, ImportError)
+#: What to do about a file, by what the system says of it.
+_ADVICE = {
+    **dict.fromkeys(
+        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO), "make room or choose another place"
+    ),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), "change its permissions or choose another place"
+    ),
+    errno.EISDIR: "name a file in it",
+    errno.ENAMETOOLONG: "choose a shorter one",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -98,11 +110,20 @@ def _run(words: Sequence[str]) -> int:
     except BrokenPipeError:
         raise
     except _EXPECTED as error:
-        return _refuse(str(error) or type(error).__name__)
+        return _refuse(_said(error))
+
+
+def _said(error: BaseException) -> str:
+    if not isinstance(error, OSError) or error.filename is None or error.strerror is None:
+        return str(error) or type(error).__name__
+    said = f"{os.fsdecode(error.filename)}: {error.strerror[:1].lower()}{error.strerror[1:]}"
+    return f"{said}; {_ADVICE[error.errno]}" if error.errno in _ADVICE else said
 
 
 def _refuse(message: str) -> int:
-    print(f"torchspline: {' '.join(message.split())}", file=sys.stderr)
+    # Names in files are repeated, and could hold what moves the cursor or colours the terminal.
+    shown = "".join(x if x.isprintable() else repr(x)[1:-1] for x in " ".join(message.split()))
+    print(f"torchspline: {shown}", file=sys.stderr)
     return 2
 
 
