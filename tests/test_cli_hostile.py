@@ -1,13 +1,16 @@
 """Commands on a full disk, on files that are not what they should be, and over their own sources."""
 
+import io
+import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import torch
 from test_cli import torchspline
 
-from torchspline import SE3, use_kernels
+from torchspline import SE3, cli, use_kernels
 from torchspline.io import PoseRecord, write_poses, write_rosbag
 from torchspline.io.archive import replacing
 
@@ -130,6 +133,51 @@ def test_topics_do_not_reach_the_terminal_as_they_are(tmp_path):
 
 
 def test_a_folder_in_place_of_a_file(tmp_path):
-    with pytest.raises(IsADirectoryError, match="expected the name of a file, got a folder"):
-        with replacing(tmp_path):
-            raise AssertionError
+    with (
+        pytest.raises(IsADirectoryError, match="expected the name of a file, got a folder"),
+        replacing(tmp_path),
+    ):
+        raise AssertionError
+
+
+def test_want_of_memory_is_said(poses, monkeypatch):
+    def greedy(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("torchspline.io.read_table", greedy)
+    refused(("info", poses), "not enough memory")
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "said"),
+    [
+        ("info {} > /dev/full", 2, "torchspline: no space left on device; make room or choose another place"),
+        (
+            "--version > /dev/full",
+            2,
+            "torchspline: no space left on device; make room or choose another place",
+        ),
+        (
+            "info - <&-",
+            2,
+            "torchspline: -: expected something on standard input, which is closed; name a file",
+        ),
+        ("--version >&-", 0, ""),
+    ],
+)
+def test_standard_streams_that_are_full_or_closed(poses, command, status, said):
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    shell = f"{sys.executable} -m torchspline.cli {command.format(poses)}"
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr.strip()) == (status, said)
+
+
+def test_a_terminal_that_knows_no_unicode(monkeypatch):
+    screen = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setattr(cli, "run", lambda words: print("m/s²") or 0)
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([])
+    screen.flush()
+    assert screen.buffer.getvalue() == b"m/s?\n"

@@ -66,6 +66,8 @@ def on_disk(path: Path) -> Iterator[Path]:
     if path != PIPE:
         yield path
         return
+    if sys.stdin is None:
+        raise ValueError("-: expected something on standard input, which is closed; name a file")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "stdin")
         with file.open("wb") as copy:

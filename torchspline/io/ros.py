@@ -158,7 +158,7 @@ def _scratch(path: Path) -> Iterator[Path]:
         scratch = Path(tempfile.mkdtemp(prefix=".", dir=path.parent))
         yield scratch
     except sqlite3.Error as reason:  # a full disk, to a database
-        raise OSError(errno.EIO, str(reason), str(path)) from None
+        raise OSError(errno.EIO, f"{reason}; make room or choose another place", str(path)) from None
     except OSError as reason:
         if reason.errno is None:
             raise
@@ -319,7 +319,9 @@ def _rows(
                 connections = [c for c in reader.connections if c.topic == chosen and c.msgtype in kinds]
                 for c, _, raw in reader.messages(connections):
                     rows += rows_in(c.msgtype, reader.deserialize(raw, c.msgtype))
-    except (MemoryError, ImportError):
+    except MemoryError:
+        raise MemoryError(f"{path}: expected a ROS bag that fits into the memory, got a larger one") from None
+    except ImportError:
         raise
     except Exception as reason:  # the library meets damage with whatever comes up
         text = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]
