@@ -126,6 +126,7 @@ def sources() -> Iterator[Case]:
     function = "from_urdf"
     yield refused(function, "source", "type", 5, "got int", "XML text or the path of a file")
     yield refused(function, "source", "option", missing, "no such file", "XML text or the path of a file")
+    yield refused(function, "source", "option", FOLDER.name, "a folder", "XML text or the path of a file")
     yield refused(function, "source", "option", "<nonsense", "cannot be read", "in source")
     yield refused(function, "source", "option", "", "got ''", "XML text or the path of a file")
     empty = URDF[: URDF.index("<link")] + '<link name="a"/></robot>'

@@ -239,7 +239,7 @@ def test_standard_input_and_output(tmp_path, monkeypatch):
         (("{u}", "{o}/x.json"), "write transforms.json"),
         (("{p}", "{o}/none/x.txt"), "the folder"),
         (("{p}", "{o}"), "to: expected tum"),
-        (("{p}", "{o}", "--to", "tum"), "Is a directory"),
+        (("{p}", "{o}", "--to", "tum"), "expected the name of a file, got a folder"),
     ],
 )  # fmt: skip
 def test_mistakes(tmp_path, words, message):

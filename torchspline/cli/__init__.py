@@ -1,10 +1,12 @@
 """The command line. `COMMANDS` lists the commands; a new one is a module beside this one and a line in it."""
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from io import TextIOWrapper
 from typing import NamedTuple
 
 from torchspline.cli.arguments import STATUS, Mistake, parse
@@ -41,11 +43,24 @@ COMMANDS: dict[str, Command] = {
     "info": Command(f"{_HERE}.info", "info", "what is in a file"),
     "kernels show": Command(f"{_HERE}.kernels", "show", "the source of a compiled loop"),
 }
-_EXPECTED = (TypeError, ValueError, OSError, MemoryError, ModuleNotFoundError)
+_EXPECTED = (TypeError, ValueError, OSError, MemoryError, ImportError)
+#: What to do about a file, by what the system says of it.
+_ADVICE = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room or choose another place"),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), "change its permissions or choose another place"
+    ),
+    errno.EISDIR: "name a file in it",
+    errno.ENAMETOOLONG: "choose a shorter one",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `torchspline` command: exits with what `run` returns."""
+    if sys.stdout is None:  # closed
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # units have characters that some terminals have not
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -56,9 +71,11 @@ def run(words: Sequence[str]) -> int:
         sys.stdout.flush()
         return status
     except BrokenPipeError:  # whoever read has enough; what is left goes nowhere
-        with suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 0
+    except OSError as error:
+        _drop_output()
+        return _refuse(_said(error))
     except KeyboardInterrupt:
         return 130
 
@@ -98,11 +115,30 @@ def _run(words: Sequence[str]) -> int:
     except BrokenPipeError:
         raise
     except _EXPECTED as error:
-        return _refuse(str(error) or type(error).__name__)
+        return _refuse(_said(error))
+
+
+def _drop_output() -> None:
+    """What is still to be printed goes nowhere, so that ending does not try again."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _said(error: BaseException) -> str:
+    if isinstance(error, MemoryError) and not str(error):
+        return "there is not enough memory for this; take a part of it, or a machine that has more"
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error) or type(error).__name__
+    said = f"{error.strerror[:1].lower()}{error.strerror[1:]}"
+    if error.filename is not None:
+        said = f"{os.fsdecode(error.filename)}: {said}"
+    return f"{said}; {_ADVICE[error.errno]}" if error.errno in _ADVICE else said
 
 
 def _refuse(message: str) -> int:
-    print(f"torchspline: {' '.join(message.split())}", file=sys.stderr)
+    # Names in files are repeated, and could hold what moves the cursor or colours the terminal.
+    shown = "".join(x if x.isprintable() else repr(x)[1:-1] for x in " ".join(message.split()))
+    print(f"torchspline: {shown}", file=sys.stderr)
     return 2
 
 

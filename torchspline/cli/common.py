@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -93,6 +94,13 @@ def fit_report(fit: PoseFit, dt: float) -> dict[str, Any]:
         "stopped": fit.reason,
         "notes": fit.notes,
     }
+
+
+def check_figure(name: str, path: Path) -> None:
+    """Whether Matplotlib can draw into a file of this name."""
+    kinds = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in kinds:
+        raise ValueError(f"{name}: expected a name that ends with .png, .pdf or .svg, got {path}")
 
 
 def save_figure(path: Path, figure: Figure, dpi: int = 130) -> None:

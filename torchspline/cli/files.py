@@ -4,7 +4,7 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +14,7 @@ import torch
 from torchspline.cli.common import longest_stretch
 from torchspline.fit import PoseFit, fit_poses
 from torchspline.io import ImuRecord, PoseRecord, read_bvh, read_imu, read_nerfstudio, read_poses
+from torchspline.io.archive import check_folder
 from torchspline.io.trajectory import even_times
 from torchspline.splines import Trajectory
 from torchspline.units import SECOND
@@ -39,12 +40,34 @@ def named_after(path: Path, suffix: str) -> Path:
     return Path(path.resolve().name.removesuffix(".gz").rsplit(".", 1)[0] + suffix)
 
 
+def check_outputs(sources: Iterable[Path | None], outputs: Iterable[tuple[str, Path | None]]) -> None:
+    """Before the work: whether there are folders for files to write, and none is a source or written twice.
+
+    Args:
+        sources: what is read.
+        outputs: names of arguments, and the files that they say.
+    """
+    taken = {x.resolve(): "the source" for x in sources if x not in (None, PIPE)}
+    for name, file in outputs:
+        if file is None or (file.exists() and not file.is_file() and not file.is_dir()):  # devices take all
+            continue
+        place = file.resolve()
+        if place in taken:
+            raise ValueError(f"{name}: expected another file than {taken[place]}, got {file}")
+        check_folder(file)
+        if file.is_dir():
+            raise ValueError(f"{name}: expected the name of a file, got the folder {file}")
+        taken[place] = f"that of {name}"
+
+
 @contextmanager
 def on_disk(path: Path) -> Iterator[Path]:
     """The path, or a file of what comes on standard input for `-`: readers look more than once."""
     if path != PIPE:
         yield path
         return
+    if sys.stdin is None:
+        raise ValueError("-: expected something on standard input, which is closed; name a file")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "stdin")
         with file.open("wb") as copy:
@@ -97,7 +120,8 @@ def open_record(
         try:
             return open_poses(file, format, times, topic, child, **options)
         except ValueError as first:
-            if format not in (None, "euroc", "ros"):
+            no_table = format is None and Path(file.name.removesuffix(".gz")).suffix in (".json", ".bvh")
+            if no_table or format not in (None, "euroc", "ros"):
                 raise
             try:
                 return read_imu(file, format, topic)

@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from torchspline.cli.common import fit_report, fit_rows, save_figure
-from torchspline.cli.files import PoseFormat, fitted, named_after, open_poses
+from torchspline.cli.common import check_figure, fit_report, fit_rows, save_figure
+from torchspline.cli.files import PoseFormat, check_outputs, fitted, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import save_trajectory
 from torchspline.units import SECOND
@@ -51,11 +51,12 @@ def fit(
         child: frame of the transforms in that topic; needed where it has several.
         figure: where to draw the residuals (png, pdf, svg).
     """
+    target = out or named_after(poses, ".npz")
+    check_outputs([poses, times], [("out", target), ("figure", figure)])
+    if figure is not None:
+        check_figure("figure", figure)
     record = open_poses(poses, format, times, topic, child)
     used, found = fitted(record, spacing, order, representation, gap, start, duration)
-    target = out or named_after(poses, ".npz")
-    if target.resolve() == poses.resolve():
-        raise ValueError(f"out: expected another file than the poses, got {target}")
     save_trajectory(target, found.trajectory)
     files = [target]
     if figure is not None:

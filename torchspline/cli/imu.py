@@ -18,7 +18,7 @@ from torchspline.cli.common import (
     write_report,
     write_results,
 )
-from torchspline.cli.files import PoseFormat, open_poses, seconds_of
+from torchspline.cli.files import PoseFormat, check_outputs, open_poses, seconds_of
 from torchspline.cli.report import Report
 from torchspline.fit import fit_poses
 from torchspline.imu import STANDARD_GRAVITY, ImuReading, measure
@@ -82,10 +82,17 @@ def imu(
         raise ValueError(f"rate: expected a finite number above zero (Hz), got {rate}")
     if not 0 <= margin < MOST_SECONDS:
         raise ValueError(f"margin: expected seconds, zero or more, got {margin}")
+    names = ["trajectory.txt", "imu.csv", "imu.png", "report.json"]
+    if recorded is not None:
+        names.append("comparison.csv")
+    files = [out / name for name in names]
+    if out.is_dir():
+        check_outputs([poses, recorded, times], [("out", file) for file in files])
+    elif out.exists():
+        raise ValueError(f"out: expected a folder, got the file {out}")
     record = open_poses(poses, format, times, topic, child)
     recording = None if recorded is None else read_imu(recorded, topic=recorded_topic)
     record = longest_stretch(record, gap, start, duration)
-    out.mkdir(parents=True, exist_ok=True)
     interval = record.time_ns.unique().diff().to(torch.float64).median().item() / SECOND
     dt = 5 * interval if spacing is None else seconds_of(spacing)
     fit = fit_poses(
@@ -117,6 +124,7 @@ def imu(
     title = f"{poses.name}: {representation} spline of order {order}, knots {dt * 1e3:.4g} ms apart"
     shown = stamps < low + 10 * SECOND
     lines, dots = excerpt(stamps, made, shown, first), None
+    compared = None
     if recording is not None:
         within = recording.window(low, high)
         if len(within) == 0:
@@ -148,14 +156,13 @@ def imu(
         early = within.time_ns < low + 10 * SECOND
         lines = lines[0], ImuReading(lines[1].gyroscope + bias[0], lines[1].accelerometer + bias[1])
         dots = excerpt(within.time_ns, ImuReading(within.gyroscope, within.accelerometer), early, first)
-        _write_comparison(out / "comparison.csv", within, biased)
+        compared = within, biased
+    out.mkdir(parents=True, exist_ok=True)  # by now nothing can be wrong with what is asked
+    if compared is not None:
+        _write_comparison(out / "comparison.csv", *compared)
     write_results(out, fit.trajectory, stamps, made)
     save_figure(out / "imu.png", imu_comparison(lines, dots, title))
     write_report(out / "report.json", report)
-    names = ["trajectory.txt", "imu.csv", "imu.png", "report.json"]
-    if recording is not None:
-        names.append("comparison.csv")
-    files = [out / name for name in names]
     return Report(f"IMU from {poses.name}", report, rows, fit.notes, files)
 
 

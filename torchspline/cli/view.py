@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from torchspline.cli.files import PoseFormat, fitted, is_trajectory, named_after, open_poses
+from torchspline.cli.files import PoseFormat, check_outputs, fitted, is_trajectory, named_after, open_poses
 from torchspline.cli.report import Report
 from torchspline.io import load_trajectory
 from torchspline.splines import Trajectory
@@ -56,6 +56,8 @@ def view(
         topic: of a ROS bag; needed where it has several with poses.
         child: frame of the transforms in that topic; needed where it has several.
     """
+    target = out or named_after(file, ".html")
+    check_outputs([file, times], [("out", target)])
     measured, notes = None, []
     trajectory: Trajectory
     if is_trajectory(file):
@@ -65,7 +67,6 @@ def view(
             open_poses(file, format, times, topic, child), spacing, order, "split", gap, start, duration
         )
         trajectory, measured, notes = fit.trajectory, used.position, fit.notes
-    target = out or named_after(file, ".html")
     write_page(target, trajectory, measured=measured, samples=samples, up=up, title=file.name)
     if open:
         import webbrowser

@@ -138,26 +138,33 @@ def replacing(path: Path) -> Iterator[Path]:
     """A name in the folder of `path` to write to; it becomes `path` when the block ends, and is gone if that fails.
 
     Whoever is interrupted in between leaves the file that was there, and no half of another. What is no regular file
-    (a pipe, /dev/stdout) is written to directly. Raises `FileNotFoundError` where the folder does not exist.
+    (a pipe, /dev/stdout) is written to directly.
+
+    Raises:
+        FileNotFoundError: the folder does not exist. IsADirectoryError: `path` is a folder.
+        OSError: as the system says, of `path`.
     """
     check_folder(path)
-    if path.exists() and (not path.is_file() or path.is_relative_to("/dev")):
-        yield path
-        return
-    target = path.resolve()  # a link stays one
-    part = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected the name of a file, got a folder")
+    direct = path.exists() and (not path.is_file() or path.is_relative_to("/dev"))
+    target = path if direct else path.resolve()  # a link stays one
+    part = path if direct else target.with_name(f".{secrets.token_hex(4)}{target.suffix}")
     try:
         yield part
-        with suppress(FileNotFoundError):
-            shutil.copymode(target, part)
-        part.replace(target)
+        if not direct:
+            with suppress(FileNotFoundError):
+                shutil.copymode(target, part)
+            part.replace(target)
     except OSError as reason:
-        if reason.filename in (str(part), part):
-            raise type(reason)(reason.errno, reason.strerror, str(path)) from None
+        # A full disk comes without a name, and nobody has heard of the part.
+        if reason.errno is not None and reason.filename in (None, str(part), part):
+            raise OSError(reason.errno, reason.strerror, str(path)) from None
         raise
     finally:
-        with suppress(OSError):
-            part.unlink()
+        if not direct:
+            with suppress(OSError):
+                part.unlink()
 
 
 def write_bytes(path: Path, content: bytes) -> None:

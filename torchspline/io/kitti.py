@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchspline.groups.group import SO3
-from torchspline.io.archive import check_folder, write_bytes
+from torchspline.io.archive import replacing, write_bytes
 from torchspline.io.records import PoseRecord
 from torchspline.io.registry import Format
 from torchspline.io.text import Table, format_seconds, parse_seconds, read_table, write_table
@@ -94,16 +94,22 @@ def write_poses(path: Path, record: PoseRecord, times: Path | None = None) -> No
     Both are gzipped where their names end with .gz. Rotations come back to rounding, as unit quaternions of either
     sign; positions and stamps exactly.
 
+    Both are written or neither.
+
     Raises:
-        ValueError: stamps are to go into the file of the poses.
+        ValueError: stamps are to go into the file of the poses, or beside what is no file.
     """
+    if times is None and path.exists() and not (path.is_file() or path.is_dir()):
+        raise ValueError(f"path: expected the name of a file, beside which its stamps can go, got {path}")
     stamps = times or times_beside(path)
     if stamps.resolve() == path.resolve():
         raise ValueError(f"times: expected another file than that of the poses, got {stamps}")
     matrices = torch.cat([_matrices(record.rotation), record.position[..., None]], -1).reshape(-1, 12)
-    check_folder(stamps)
-    write_table(path, "", (), matrices.detach().cpu().numpy(), " ")
-    write_bytes(stamps, "".join(f"{format_seconds(t)}\n" for t in record.time_ns.tolist()).encode())
+    with replacing(path) as part, replacing(stamps) as part_of_stamps:
+        write_table(part, "", (), matrices.detach().cpu().numpy(), " ")
+        write_bytes(
+            part_of_stamps, "".join(f"{format_seconds(t)}\n" for t in record.time_ns.tolist()).encode()
+        )
 
 
 def _matrices(rotation: torch.Tensor) -> torch.Tensor:

@@ -50,12 +50,14 @@ def write_rerun(
     check_folder(Path(path))
     rr = _library()
     first = min(int(stamps.min()) for stamps, _ in series.values())
-    with replacing(Path(path)) as part, rr.RecordingStream("torchspline") as stream:
-        stream.save(part)
+    # In memory, since the library's own writing to files neither says nor notices that a disk is full.
+    with rr.RecordingStream("torchspline") as stream:
+        memory = stream.memory_recording()
         for name, (stamps, columns) in series.items():
             _log(rr, stream, name, _clock(rr, stamps, dates=first >= _DATES), columns)
-        stream.flush()
-        stream.disconnect()
+        content = memory.drain_as_bytes()
+    with replacing(Path(path)) as part:
+        part.write_bytes(content)
 
 
 def _checked(records: Any) -> Mapping[str, Any]:

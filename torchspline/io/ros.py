@@ -1,10 +1,13 @@
 """ROS bags, of ROS 1 and 2 (MCAP and SQLite), through the package rosbags: no ROS needed."""
 
+import errno
 import io
 import os
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -106,7 +109,7 @@ def write_rosbag(
         child: the frame whose poses they are; messages of the first two kinds have no place for it.
     Raises:
         FileExistsError: there is something at `path`. FileNotFoundError: the folder it is to stand in is not there.
-        ImportError: the package rosbags is not installed.
+        ImportError: the package rosbags is not installed. OSError: it cannot be written, for want of room say.
         ValueError: no records, an empty one, or stamps that such messages cannot hold (before 1970, after 2038).
     """
     if not isinstance(path, (str, PathLike)):
@@ -126,9 +129,7 @@ def write_rosbag(
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
     if _TREES[0] not in store.types:
         store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TREES[0]))
-    # Whoever is interrupted leaves no half of a bag.
-    scratch = Path(tempfile.mkdtemp(prefix=".", dir=path.parent))
-    try:
+    with _scratch(path) as scratch:
         bag = scratch / path.name
         if first:
             writer = _library("rosbag1").Writer(bag)
@@ -147,8 +148,24 @@ def write_rosbag(
         if path.suffix in (".mcap", ".db3"):
             (bag,) = bag.glob(f"*{path.suffix}")
         bag.rename(path)
+
+
+@contextmanager
+def _scratch(path: Path) -> Iterator[Path]:
+    """A folder beside `path` to make it in: whoever is interrupted leaves no half of a bag."""
+    scratch = None
+    try:
+        scratch = Path(tempfile.mkdtemp(prefix=".", dir=path.parent))
+        yield scratch
+    except sqlite3.Error as reason:  # a full disk, to a database
+        raise OSError(errno.EIO, f"{reason}; make room or choose another place", str(path)) from None
+    except OSError as reason:
+        if reason.errno is None:
+            raise
+        raise OSError(reason.errno, reason.strerror, str(path)) from None
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
 
 
 class _Maker:
@@ -302,7 +319,9 @@ def _rows(
                 connections = [c for c in reader.connections if c.topic == chosen and c.msgtype in kinds]
                 for c, _, raw in reader.messages(connections):
                     rows += rows_in(c.msgtype, reader.deserialize(raw, c.msgtype))
-    except (MemoryError, ImportError):
+    except MemoryError:
+        raise MemoryError(f"{path}: expected a ROS bag that fits into the memory, got a larger one") from None
+    except ImportError:
         raise
     except Exception as reason:  # the library meets damage with whatever comes up
         text = " ".join(f"{type(reason).__name__}: {reason}".split())[:200]

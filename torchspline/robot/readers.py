@@ -90,9 +90,8 @@ def content(source: str | PathLike[str]) -> tuple[str, bytes]:
     path = Path(source)
     if not str(source) or not path.is_file():
         came = str(source) if len(str(source)) <= 200 else str(source)[:197] + "..."
-        raise FileNotFoundError(
-            f"source: expected XML text or the path of a file, got {came!r}: no such file"
-        )
+        what = "a folder" if path.is_dir() else "no such file"
+        raise FileNotFoundError(f"source: expected XML text or the path of a file, got {came!r}: {what}")
     return str(path), path.read_bytes()
 
 

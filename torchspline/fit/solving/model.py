@@ -89,15 +89,21 @@ def with_points(spline: BSpline, points: torch.Tensor) -> BSpline:
 class State:
     """Numbers of all unknowns."""
 
+    #: Control points (M, P) of each spline, by the `id` of its module.
     points: dict[int, Array]
+    #: Of each variable, by its `id`.
     values: dict[int, torch.Tensor]
-    #: Of the trajectory, computed once from its points.
+    #: Of the trajectory, computed once from its points: logarithms between neighbours, the local coordinates of rows.
     local: Local | None = None
+    #: And how each of them moves with its two control points, by the chain rule: `LocalSpline.pair_jacobians`.
     chain: Array | None = None
 
 
 class Model:
     """Splines, the trajectory first, and variables of a problem, and which columns are theirs.
+
+    `columns` has them by the `id` of the unknown, one row a control point or element, -1 for what stays. The first
+    `band` of the `total` columns are those of splines.
 
     Args:
         frozen: for splines a mask of control points that stay, for variables whether they stay.

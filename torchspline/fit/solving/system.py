@@ -1,6 +1,13 @@
 """Normal equations of a step: a band with a border in LAPACK storage, or a sparse matrix where the band breaks.
 
-`A` is the part of the splines, `B` its coupling to the border of variables, `C` the border's own part.
+With n columns of splines and m of variables, symmetric parts by their lower halves:
+
+| symbol | what | in `BandSystem` |
+|---|---|---|
+| `A` (n, n) | the part of the splines | `band[j, d]` is the element (j + d, j) |
+| `B` (n, m) | its coupling to the border of variables | `border` |
+| `C` (m, m) | the border's own part | `corner` |
+| `J^T r` (n + m,) | the gradient of the cost; a step solves for minus this | `right` |
 """
 
 from abc import ABC, abstractmethod
@@ -23,11 +30,18 @@ _PIECE, _COLUMNS = 256, 256
 
 
 class Rows(NamedTuple):
-    """What a chunk adds to the normal equations, see `kernels/assemble.py`."""
+    """What a chunk adds to the normal equations, see `kernels/assemble.py`.
 
+    Rows come in runs that touch the same unknowns.
+    """
+
+    #: (N, R, W): `[J | r]` of each measurement, the trajectory's part in local coordinates.
     rows: Array
+    #: (runs + 1,): where each run begins among the N.
     starts: Array
+    #: (runs, splines): the first control point that a run touches.
     bases: Array
+    #: (runs, W - 1): columns of the unknowns; -1 for those that stay.
     columns: Array
     #: Control points that a row's local coordinates span.
     span: int
@@ -317,6 +331,8 @@ class SparseSystem(System):
 
 
 class SparseFactor(Factor):
+    """An LU factorisation, which SciPy has where it has no sparse Cholesky; elements of the inverse by solving."""
+
     def __init__(self, matrix: Any, damping: Array):
         from scipy.sparse import diags
         from scipy.sparse.linalg import splu
