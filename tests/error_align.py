@@ -106,10 +106,13 @@ def cases() -> Iterator[Case]:
             if case.changes[name] is not None:  # None: any, and estimated
                 yield case
     for bad in (None, 1, "yes"):
-        yield refused(function, "estimate_skew", "type", bad, f"got {type(bad).__name__}", "True or False")
+        for name in ("estimate_skew", "estimate_delay"):
+            yield refused(function, name, "type", bad, f"got {type(bad).__name__}", "True or False")
     for bad in ("Huber", 1.0, Huber):
         yield refused(function, "loss", "type", bad, f"got {type(bad).__name__}", "a robust loss")
     function = "Alignment.pose_time"
+    for bad in (None, "accelerometer", 1):
+        yield refused(function, "sensor", "option", bad, f"got {bad!r}", "'gyro', 'accel'")
     for bad in (READ_AT.tolist(), READ_AT.numpy(), None, 1.0):
         yield refused(function, "t", "type", bad, f"got {type(bad).__name__}", "a torch.Tensor")
     for dtype in (I64, F32):
