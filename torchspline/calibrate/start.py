@@ -326,8 +326,8 @@ def _aligned(
             f"{names}: the motion explains {max(force, 0.0):.0%} of the accelerometer's variance only: are its "
             "axes those of the gyroscope, and are the size of the board and the focal lengths right?"
         )
-    # Readings far off are the rule here: the first spline is too stiff for the fastest motion. Where they are so far off
-    # that more must be wrong, the words above say so.
+    # Readings far off are the rule here: the first spline is too stiff for the fastest motion. Where they are so far
+    # off that more must be wrong, the words above say so.
     usual = "standard deviations off", "the motion leaves"
     notes += [f"{names}: {note}" for note in found.notes if not any(words in note for words in usual)]
     if abs(found.time_offset - known) > _APART:
