@@ -18,7 +18,7 @@ from torchspline.fit.solving.model import with_points
 from torchspline.groups.group import SO3
 from torchspline.imu.synthesis import STANDARD_GRAVITY
 from torchspline.splines.bspline import BSpline
-from torchspline.units import NANOSECOND, nanoseconds
+from torchspline.units import NANOSECOND, nanoseconds, seconds_since
 
 Array = NDArray[Any]
 _MAGNITUDE = math.hypot(*STANDARD_GRAVITY)
@@ -79,8 +79,7 @@ class Alignment:
         expected = torch.int64 if isinstance(first, int) else torch.float64
         if t.dtype != expected:
             raise TypeError(f"t: expected {expected} as the stamps that were aligned, got {t.dtype}")
-        # Before the factor: torch makes float32 of whole numbers times a float.
-        s = (t - first).to(torch.float64) * (NANOSECOND if isinstance(first, int) else 1.0)
+        s = seconds_since(t, first)
         mid = (self.t_mid - origin) * (NANOSECOND if isinstance(origin, int) else 1.0)
         late = self.accel_delay if sensor == "accel" else 0.0
         tau = mid + (s - lag - mid - late) / (1.0 + self.clock_skew)
@@ -184,9 +183,7 @@ class _Stamps:
         t = t.detach().cpu()
         self.first: float | int = t[finite].min().item()
         self.origin = trajectory.domain[0]
-        self.s = (
-            (t - self.first).numpy() * NANOSECOND if isinstance(self.first, int) else (t - self.first).numpy()
-        )
+        self.s = seconds_since(t, self.first).numpy()
         if isinstance(self.first, int) and isinstance(self.origin, int):
             self.epoch = (self.first - self.origin) * NANOSECOND
         else:
